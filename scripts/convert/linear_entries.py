@@ -9,10 +9,11 @@
 
 In weights of the recipe `window` without `linear_entries`, the levels at a quarter and an eighth of the
 resolution may be dead (docs/notes/network/dead-levels.md): they hand a constant to the finest level, whatever
-the input. This script keeps the constant, and replaces these levels by ones that can learn. What they add is
-small at first: `up.0` starts at a tenth of its usual size.
+the input. This script keeps the constant, also for the learnt flow, which sees the pre-denoiser's levels, and
+replaces these levels by ones that can learn. What they add is small at first: `up.0` and the flow's `compared`
+start at a tenth of their usual size.
 
-The constant is the one of dead levels. Levels that compute something lose it.
+The constant is the one of dead levels, away from the border of the frame. Levels that compute something lose it.
 """
 
 import argparse
@@ -38,7 +39,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=58)
     arguments = parser.parse_args()
     with safe_open(arguments.weights, "np") as file:
-        values = {name: file.get_tensor(name).astype(np.float32) for name in file.keys()}
+        stored = {name: file.get_tensor(name) for name in file.keys()}
         metadata = dict(file.metadata() or {})
     description = json.loads(metadata.get("qudi", "{}"))
     network = description.get("network", {})
@@ -47,12 +48,13 @@ def main() -> None:
     if network.get("linear_entries"):
         sys.exit(f"{arguments.weights}: these weights have linear entries already")
     network["linear_entries"] = True
+    values = {name: value.astype(np.float32) for name, value in stored.items()}
     random = np.random.default_rng(arguments.seed)
     for part in PARTS:
         renew(values, f"{part}.hourglass.", random)
     metadata["qudi"] = json.dumps(description, separators=(",", ":"))
-    half = {name: value.astype(np.float16) for name, value in values.items()}
-    save_file(half, arguments.output, metadata=metadata)
+    kept = {name: value.astype(stored[name].dtype) for name, value in values.items()}
+    save_file(kept, arguments.output, metadata=metadata)
 
 
 def renew(values: dict[str, np.ndarray], hourglass: str, random: np.random.Generator) -> None:
@@ -63,10 +65,21 @@ def renew(values: dict[str, np.ndarray], hourglass: str, random: np.random.Gener
         bound = scale * np.sqrt(6 / np.prod(shape[1:]))
         values[hourglass + name] = random.uniform(-bound, bound, shape).astype(np.float32)
 
-    block = f"{hourglass}decoder.1.blocks.0."
-    constant = values[block + "second.weight"].sum((2, 3)) @ np.maximum(values[block + "first.bias"], 0)
-    constant = constant + values[block + "second.bias"]
-    values[hourglass + "up.0.bias"] += values[hourglass + "up.0.weight"][:, :, 0, 0] @ constant
+    def constant_of(level: str) -> np.ndarray:
+        block = f"{hourglass}{level}.blocks.0."
+        inner = np.maximum(values[block + "first.bias"], 0)
+        return values[block + "second.weight"].sum((2, 3)) @ inner + values[block + "second.bias"]
+
+    def keep(layer: str, level: str) -> None:
+        weight, bias = values[f"{layer}.weight"], values[f"{layer}.bias"]
+        bias += weight[:, :, 0, 0] @ constant_of(level)
+        bound = FIRST_STEP * np.sqrt(6 / weight.shape[1])
+        weight[:] = random.uniform(-bound, bound, weight.shape)
+
+    keep(f"{hourglass}up.0", "decoder.1")
+    if hourglass.startswith("pre."):
+        keep("flow.levels.1.compared", "decoder.1")
+        keep("flow.levels.2.compared", "encoder.2")
     for level in LEVELS:
         draw(f"{level}.entry.weight", LINEAR)
         draw(f"{level}.blocks.0.first.weight", 1.0)
@@ -75,7 +88,6 @@ def renew(values: dict[str, np.ndarray], hourglass: str, random: np.random.Gener
             values[f"{hourglass}{level}.{bias}.bias"][:] = 0
     draw("up.1.weight", LINEAR)
     values[hourglass + "up.1.bias"][:] = 0
-    draw("up.0.weight", FIRST_STEP)
 
 
 if __name__ == "__main__":
