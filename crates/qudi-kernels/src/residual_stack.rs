@@ -87,6 +87,7 @@ impl Stack {
     }
 
     /// Returns true if a ReLU follows the entry.
+    #[cfg(any(feature = "flex", feature = "libtorch"))]
     pub(crate) fn rectifies(&self) -> bool {
         self.entry == Activation::Relu
     }

@@ -5,7 +5,7 @@ pub(crate) mod burst;
 mod draw;
 mod sampler;
 
-use crate::dataset::{DataConfig, Pack, Sample};
+use crate::dataset::{DataConfig, Pack, Sample, SensorMix};
 use crate::digest::Digest;
 use crate::parameters::parameters;
 use crate::recipe::{CropsConfig, Recipe};
@@ -132,6 +132,8 @@ pub(super) struct BurstCache {
 struct CacheKey {
     program: String,
     data: DataConfig,
+    /// The sensors that the recipe names: a file of a sensor may change.
+    sensors: Vec<Sensor>,
     /// Digest of the decoded files.
     pack: Option<String>,
     seed: u64,
@@ -219,6 +221,7 @@ impl BurstCache {
         let key = CacheKey {
             program: env!("CARGO_PKG_VERSION").to_owned(),
             data: recipe.data.clone(),
+            sensors: recipe.data.sensor.iter().map(SensorMix::load).collect::<Result<_>>()?,
             pack,
             seed: recipe.train.seed,
             cached_frames: crops.cached_frames,

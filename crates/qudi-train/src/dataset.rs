@@ -12,8 +12,10 @@ mod pack_index;
 mod pack_writer;
 mod sample;
 
+pub(crate) use config::refuse_dark_map;
 pub use config::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
 pub use pack::{Pack, PackedFrame};
 pub use pack_index::{Clip, ClipWindow, PackedSource};
 pub use pack_writer::{PackProgress, write_pack};
+pub(crate) use sample::acquisition;
 pub use sample::{Dataset, Sample};

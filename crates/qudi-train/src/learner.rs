@@ -93,6 +93,12 @@ pub trait Learner: Module + Sync {
         vec![true; self.named_shapes().len()]
     }
 
+    /// Returns the names of the layers whose input is zero in all samples of a recipe: no gradient reaches
+    /// them.
+    fn idle_layers(_recipe: &Recipe) -> &'static [&'static str] {
+        &[]
+    }
+
     /// Returns true if a parameter learns with Adam under every optimizer.
     fn prefers_adam(_name: &str) -> bool {
         false
@@ -170,20 +176,49 @@ impl Debug for Loss<'_> {
     }
 }
 
-/// Loads a network of the sizes of a recipe.
+/// Loads the network of a recipe.
 ///
 /// # Errors
-/// [`Error`] if the file holds another network, or one of other sizes.
+/// [`Error`] if the file holds another network, or one with other keys, which it names.
 fn load_fitting<N: Network>(path: &Path, sizes: &NetworkConfig, device: &Device) -> Result<N> {
     let (network, description) = load(path, device)?;
     if description.network == *sizes {
         return Ok(network);
     }
+    let keys = differing_keys(&description.network, sizes).join(", ");
     Err(Error::data(
-        "these weights are for a network of other sizes than the recipe's",
+        format!(
+            "these weights are for another network than the recipe's, with other values of {keys}"
+        ),
         path,
         "choose the recipe that they were trained with, or its [network] table",
     ))
+}
+
+/// Returns the keys of `[network]` with different values.
+fn differing_keys(one: &NetworkConfig, other: &NetworkConfig) -> Vec<String> {
+    let table = |sizes| toml::Table::try_from(sizes).unwrap_or_default();
+    let mut keys = Vec::new();
+    compare(&table(one), &table(other), "network", &mut keys);
+    keys
+}
+
+/// Adds the names of the keys of tables at `place` with different values. A key without a value has its
+/// default, which is false for those that are left out.
+fn compare(one: &toml::Table, other: &toml::Table, place: &str, keys: &mut Vec<String>) {
+    let absent = toml::Value::Boolean(false);
+    let mut names: Vec<&String> = one.keys().chain(other.keys()).collect();
+    names.sort();
+    names.dedup();
+    for name in names {
+        let [a, b] = [one, other].map(|table| table.get(name).unwrap_or(&absent));
+        let place = format!("{place}.{name}");
+        match (a, b) {
+            (toml::Value::Table(a), toml::Value::Table(b)) => compare(a, b, &place, keys),
+            _ if a != b => keys.push(place),
+            _ => {}
+        }
+    }
 }
 
 /// Writes a network of these sizes, with a description of its training.
@@ -231,5 +266,23 @@ fn provenance(recipe: &Recipe, origin: &Origin) -> Provenance {
         commit: origin.commit.clone(),
         licence: recipe.train.licence.clone(),
         recipes: origin.earlier.iter().cloned().chain([recipe.text()]).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_that_differ_are_named() {
+        let preset = |name| NetworkConfig::preset(name).unwrap_or_else(|e| panic!("{e}"));
+        let window = preset("window");
+        assert!(differing_keys(&window, &window).is_empty());
+        let NetworkConfig::Window(mut config) = window.clone() else { panic!("a window network") };
+        config.linear_entries = false;
+        config.state = 32;
+        let other = NetworkConfig::Window(config);
+        assert_eq!(differing_keys(&window, &other), ["network.linear_entries", "network.state"]);
+        assert!(differing_keys(&window, &preset("small")).contains(&"network.kind".to_owned()));
     }
 }

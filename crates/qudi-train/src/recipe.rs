@@ -70,7 +70,7 @@ pub struct TrainConfig {
     pub optimizer: OptimizerKind,
     /// Learning rate after the warm-up; a cosine leads from it to `min_lr`.
     pub lr: f64,
-    /// Learning rate of the last step.
+    /// Learning rate that the last steps fall to.
     pub min_lr: f64,
     /// Steps of linear warm-up.
     pub warmup: u64,

@@ -136,6 +136,7 @@ impl<L: Learner> Run<L> {
         {
             self.log(&mut metrics, &Line::Validation(&validation))?;
             if on(Event::Validation(&validation)).is_break() {
+                self.save()?;
                 return Err(Error::Interrupted);
             }
         }
@@ -171,15 +172,14 @@ impl<L: Learner> Run<L> {
             }
             if saves || go_on.is_break() {
                 metrics.sync_data().map_err(|e| self.failed(METRICS, e))?;
-                self.trainer.save_state(&self.folder)?;
-                self.save_weights()?;
+                self.save()?;
                 if on(Event::Saved(step)).is_break() {
                     go_on = ControlFlow::Break(());
                 }
                 let known = std::mem::replace(&mut dead, self.trainer.dead_layers()?);
-                if dead.iter().any(|name| !known.contains(name))
-                    && on(Event::Dead(&dead)).is_break()
-                {
+                let mut new = dead.clone();
+                new.retain(|name| !known.contains(name));
+                if !new.is_empty() && on(Event::Dead(&new)).is_break() {
                     go_on = ControlFlow::Break(());
                 }
             }
@@ -195,6 +195,12 @@ impl<L: Learner> Run<L> {
         let Some(validator) = &self.validator else { return Ok(None) };
         let mut restorer = self.trainer.averaged().restorer(&self.recipe, &self.device)?;
         validator.measure(restorer.as_mut(), step).map(Some)
+    }
+
+    /// Writes weights and state: weights first, since a run whose state is at its end is taken as finished.
+    fn save(&mut self) -> Result<()> {
+        self.save_weights()?;
+        self.trainer.save_state(&self.folder)
     }
 
     fn save_weights(&self) -> Result<()> {

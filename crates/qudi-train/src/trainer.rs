@@ -146,13 +146,25 @@ impl<L: Learner> Trainer<L> {
     }
 
     /// Returns the names of the layers that no gradient reaches any more, though others of their part learn.
+    /// None before the tenth step.
     ///
     /// # Errors
     /// [`Error`] if the device fails.
     pub fn dead_layers(&self) -> Result<Vec<String>> {
+        if self.step_number() < dead_layers::FIRST_STEPS {
+            return Ok(Vec::new());
+        }
         let names: Vec<String> =
             self.network.named_shapes().into_iter().map(|(name, _)| name).collect();
-        dead_layers::dead_layers(&names, &self.optimizer.mean, &self.learns)
+        let idle = L::idle_layers(&self.recipe);
+        let is_idle =
+            |name: &str| idle.iter().any(|layer| name.trim_end_matches(".weight") == *layer);
+        let learns: Vec<bool> = names
+            .iter()
+            .zip(&self.learns)
+            .map(|(name, learns)| *learns && !is_idle(name))
+            .collect();
+        dead_layers::dead_layers(&names, &self.optimizer.mean, &learns)
     }
 
     /// Returns the number of batches used.
@@ -255,13 +267,11 @@ impl<L: Learner> Trainer<L> {
         let numbers = read(Tensor::cat(numbers.collect(), 0))?;
         let (norm, numbers) = numbers.split_last().expect("a norm");
         let mut numbers = numbers.iter().copied().map(f64::from);
-        for loss in &losses {
-            let values = loss.values(&mut numbers);
-            for (name, value) in &values.terms {
-                check(&format!("{name} loss"), *value, report.step, self.saved)?;
-            }
-            report.loss.add(&values, 1.0 / losses.len() as f64);
+        let losses: Vec<_> = losses.iter().map(|loss| loss.values(&mut numbers)).collect();
+        for (name, value) in losses.iter().flat_map(|loss| &loss.terms) {
+            check(&format!("{name} loss"), *value, report.step, self.saved)?;
         }
+        report.loss = LossValues::mean(&losses);
         report.norm = f64::from(*norm);
         check("gradient norm", report.norm, report.step, self.saved)?;
         Ok(Some(report))

@@ -1,14 +1,15 @@
 //! Measurement of a network on fixed bursts.
 
 use super::recipe::{Recipe, VALIDATION, ValidationConfig};
-use crate::dataset::Pack;
+use crate::dataset::{Pack, acquisition, refuse_dark_map};
 use qudi_core::fitting_mean_level;
 use qudi_core::metrics::{gain_aligned_psnr, psnr, ssim};
-use qudi_core::restorer::{Acquisition, BurstView, Restorer};
+use qudi_core::restorer::{BurstView, Restorer};
 use qudi_core::sensor::Sensor;
-use qudi_core::{Camera, Error, Frame, Light, Result, Size, USUAL_MEAN_LEVEL};
+use qudi_core::{Camera, Error, Frame, Light, Result, RollingShutter, Size, USUAL_MEAN_LEVEL};
 use qudi_sim::scene::{Procedural, ProceduralScene};
 use serde::Serialize;
+use std::slice::from_ref;
 
 /// Seed of the photons.
 const SEED: u64 = 2026;
@@ -73,7 +74,7 @@ impl Validator {
                 return Err(Error::request(what, "validation.from", "correct the recipe"));
             };
             let scene = Procedural { kind, size: side, seed: SEED, speed: SPEED }.scene();
-            let frames = (0..config.frames).map(|t| scene.render(t as f64)).collect();
+            let frames: Vec<_> = (0..config.frames).map(|t| scene.render(t as f64)).collect();
             clips.push((name.to_owned(), frames));
         }
         if recipe.validation_source().is_some() {
@@ -114,6 +115,11 @@ impl Validator {
             ));
         }
         let sensor = Sensor::load(&config.sensor)?.as_read();
+        refuse_dark_map(&sensor, "validation.sensor")?;
+        for (_, frames) in &mut clips {
+            let mut shutter = RollingShutter::new(&sensor);
+            *frames = frames.iter().flat_map(|frame| shutter.roll(from_ref(frame))).collect();
+        }
         Ok(Some(Self { config, clips, sensor }))
     }
 
@@ -136,8 +142,8 @@ impl Validator {
                 let mut camera = Camera::new(&self.sensor, size, light, SEED + number as u64)?;
                 let counts = (0..).zip(truth).map(|(t, frame)| camera.expose(t, &[frame]));
                 let counts: Vec<Vec<u16>> = counts.collect::<Result<_>>()?;
-                let mut acquisition =
-                    Acquisition::new(self.sensor.clone(), ppp, USUAL_MEAN_LEVEL)?.with_seed(SEED);
+                let acquisition = acquisition(&self.sensor, ppp, USUAL_MEAN_LEVEL)?;
+                let mut acquisition = acquisition.with_seed(SEED);
                 let read = |frame: u64| Ok(counts[frame as usize].clone());
                 acquisition.mean_level =
                     fitting_mean_level(size, counts.len() as u64, &acquisition, read)?;

@@ -323,6 +323,40 @@ fn light_is_log_uniform_and_counts_follow_it() {
     assert!((seen / expected - 1.0).abs() < 0.02, "{seen} {expected}");
 }
 
+/// Draws from dead leaves with a file of a sensor.
+fn dataset_of(folder: &Path, sensor: &str) -> Result<Dataset, Error> {
+    let path = folder.join("lab.toml");
+    std::fs::write(&path, format!("base = \"qudi-paper\"\n{sensor}")).unwrap();
+    let mut config = config(vec![source("scenes", SourceKind::Scenes, &["dead-leaves"])]);
+    path.to_str().unwrap().clone_into(&mut config.sensor[0].name);
+    Dataset::new(&config, None)
+}
+
+/// Cross-talk is counted as light, as `restore` does, and a pattern of hot pixels is never the same.
+#[test]
+fn samples_know_of_defects_what_restore_does() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = dataset_of(folder.path(), "[defects]\ncrosstalk = 0.03").unwrap();
+    let plain = dataset_of(folder.path(), "").unwrap();
+    let (sample, plain) = (dataset.sample(9, 1).unwrap(), plain.sample(9, 1).unwrap());
+    let [seen, without] = [&sample, &plain].map(|sample| &sample.acquisition.sensor);
+    assert_eq!(seen.defects.crosstalk, 0.0);
+    let factor = seen.quantum_efficiency / without.quantum_efficiency;
+    assert!((factor - 1.12).abs() < 1e-9, "{factor}");
+    let defects = "[defects]\nhot_fraction = 0.1\nhot_dark = 1000.0";
+    let dataset = dataset_of(folder.path(), defects).unwrap();
+    let hot = |number| {
+        let sample = dataset.sample(9, number).unwrap();
+        let is_hot = |at: &usize| sample.counts.iter().all(|frame| frame[*at] == 7);
+        (0..sample.counts[0].len()).filter(is_hot).collect::<Vec<_>>()
+    };
+    assert!(hot(0).len() > 5 && hot(1).len() > 5 && hot(0) != hot(1));
+    let map = folder.path().join("map.npy");
+    let error = dataset_of(folder.path(), &format!("[defects]\ndark_map = {map:?}")).unwrap_err();
+    assert!(error.to_string().contains("map.npy"), "{error}");
+    assert!(error.place().is_some_and(|place| place == "data.sensor"));
+}
+
 #[test]
 fn rejects_data_that_cannot_be_sampled() {
     let folder = tempfile::tempdir().unwrap();

@@ -2,14 +2,15 @@
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::Device;
+use qudi_model::diffusion::Diffusion;
 use qudi_model::window::Window;
 use qudi_model::{init_parameters, parameter_shapes};
 use qudi_train::{Event, Files, From, Learner, Origin, Recipe, Run, parameters};
 use std::collections::HashMap;
 use std::ops::ControlFlow;
 
-/// Returns a small window network whose levels can go dead, and that trains for six steps, its state written
-/// after every second one.
+/// Returns a small window network whose levels can go dead, and that trains for fourteen steps, its state
+/// written after every second one.
 fn recipe() -> Recipe {
     let changes = [
         ("network.widths", "[16, 16, 16]"),
@@ -18,12 +19,12 @@ fn recipe() -> Recipe {
         ("network.linear_entries", "false"),
         ("data.crop", "32"),
         ("data.frames", "3"),
-        ("train.steps", "6"),
+        ("train.steps", "14"),
         ("train.checkpoint", "2"),
         ("train.warmup", "2"),
         ("validation.frames", "3"),
         ("validation.crop", "32"),
-        ("validation.every", "6"),
+        ("validation.every", "14"),
     ];
     let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
     Recipe::load("tiny", &changes).unwrap()
@@ -39,13 +40,17 @@ fn told(bias: Option<(&str, f32)>) -> Vec<Vec<String>> {
     if let Some((name, value)) = bias {
         values.get_mut(name).unwrap().fill(value);
     }
-    let network = init_parameters(network, |name, _| values[name].clone());
+    told_in(&recipe, init_parameters(network, |name, _| values[name].clone()))
+}
+
+/// Trains a network by a recipe, and returns what is told of dead layers.
+fn told_in<L: Learner>(recipe: &Recipe, network: L) -> Vec<Vec<String>> {
     let folder = tempfile::tempdir().unwrap();
     let start = From::Start(Some(Box::new(network)));
     let devices = [Device::flex()];
     let mut run = Run::open(
         folder.path(),
-        &recipe,
+        recipe,
         start,
         Files::default(),
         &devices,
@@ -82,4 +87,27 @@ fn a_dead_level_is_told_with_what_lies_behind_it() {
 #[test]
 fn nothing_is_told_of_layers_that_learn() {
     assert_eq!(told(None), Vec::<Vec<String>>::new());
+}
+
+/// Nothing is told of layers whose input the recipe leaves at zero, nor in the first steps, when layers that
+/// begin at zero pass no gradient.
+#[test]
+fn nothing_is_told_of_layers_without_input_or_in_the_first_steps() {
+    let at_start = ("train.noise_start_fraction", "1.0");
+    for (steps, changes) in [("1", &[][..]), ("12", &[at_start][..])] {
+        let mut all = vec![
+            ("data.crop", "32"),
+            ("data.frames", "3"),
+            ("train.steps", steps),
+            ("train.checkpoint", "1"),
+            ("validation.frames", "3"),
+            ("validation.crop", "32"),
+        ];
+        all.extend(changes);
+        let all: Vec<_> = all.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
+        let text = include_str!("../../../tests/golden/tiny.toml");
+        let recipe = Recipe::parse(text, "tests/golden", &all).unwrap();
+        let network = Diffusion::init(&recipe, &Device::flex()).unwrap();
+        assert_eq!(told_in(&recipe, network), Vec::<Vec<String>>::new(), "{steps} steps");
+    }
 }

@@ -77,6 +77,7 @@ fn open<L: Learner>(folder: &Path, recipe: &Recipe, from: From<L>) -> Result<Run
 fn learn<L: Learner>(run: &mut Run<L>, stop_after: u64) -> Result<(), Error> {
     run.learn(1, &mut |event| match event {
         Event::Step(report) if report.step == stop_after => ControlFlow::Break(()),
+        Event::Validation(validation) if validation.step == stop_after => ControlFlow::Break(()),
         _ => ControlFlow::Continue(()),
     })
 }
@@ -179,15 +180,16 @@ fn weights_do_not_depend_on_the_number_of_devices() {
     assert!(mean / (whole.len() as f32) < 2e-5, "{}", mean / whole.len() as f32);
 }
 
-/// The second half after a stop, in another process as it were, gives the bits of an undisturbed run.
+/// What follows a stop, in another process as it were, gives the bits of an undisturbed run; also a stop in
+/// the validation before the first step.
 #[test]
 fn resumed_run_equals_undisturbed_run() {
     let recipe = recipe(&[("train.optimizer", "\"muon\"")]);
     let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
     let mut run = open::<Diffusion>(folders[0].path(), &recipe, From::Start(None)).unwrap();
     learn(&mut run, u64::MAX).unwrap();
-    for stop in [1, 4] {
-        let from = if stop == 1 { From::Start(None) } else { From::State };
+    for stop in [0, 1, 4] {
+        let from = if stop == 0 { From::Start(None) } else { From::State };
         let mut run = open::<Diffusion>(folders[1].path(), &recipe, from).unwrap();
         assert!(matches!(learn(&mut run, stop), Err(Error::Interrupted)));
         assert_eq!(run.progress(), [stop, 6]);

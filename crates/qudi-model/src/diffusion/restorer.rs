@@ -430,9 +430,9 @@ mod tests {
         }
     }
 
-    /// Restores a window of `size` in tiles of 32 pixels, in batches of so many pixels, with the dark rates
-    /// of its pixels.
-    fn restore(size: Size, batch_pixels: usize, dark: Option<Vec<f32>>) -> Vec<f32> {
+    /// Restores a window of `size` in tiles of 32 pixels, in batches of so many pixels, in so many steps,
+    /// with the dark rates of its pixels.
+    fn restore(size: Size, batch_pixels: usize, steps: usize, dark: Option<Vec<f32>>) -> Vec<f32> {
         let device = Device::flex();
         let pixel = |i: usize, t: usize| ((i * 7 + t * 13 + i / size.width) % 8) as u16;
         let frame = |t: usize| (0..size.pixels()).map(|i| pixel(i, t)).collect();
@@ -442,7 +442,7 @@ mod tests {
         let acquisition = Acquisition { dark, ..acquisition };
         let network: Window = config().init(1, &device);
         let model = Model { network, config: config(), window: 11, passes: 2 };
-        let options = SampleOptions { steps: 3, passes: 2, tile: 32, ..SampleOptions::default() };
+        let options = SampleOptions { steps, passes: 2, tile: 32, ..SampleOptions::default() };
         let mut restorer =
             DiffusionRestorer::new(model, options, &device).unwrap_or_else(|e| panic!("{e}"));
         restorer.batch_pixels = batch_pixels;
@@ -456,8 +456,8 @@ mod tests {
     fn batches_of_tiles_are_tiles_one_by_one() {
         let size = Size { height: 48, width: 80 };
         assert_eq!(Tiling::new(size, 8, 32).tiles.count(), 6, "the batches of this test");
-        let single = restore(size, 0, None);
-        let batches = restore(size, 4 * 3 * 32 * 32, None);
+        let single = restore(size, 0, 3, None);
+        let batches = restore(size, 4 * 3 * 32 * 32, 3, None);
         let pairs = single.iter().zip(&batches);
         assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-4), "batches differ from tiles");
         assert!(single.iter().any(|&value| value != single[0]), "a flat picture tests nothing");
@@ -472,11 +472,14 @@ mod tests {
             let rate = |i: usize| if i % size.width < 60 { 1.6 } else { hot };
             Some((0..size.pixels()).map(rate).collect())
         };
-        let (flat, hot) = (restore(size, 0, map(1.6)), restore(size, 0, map(3.2)));
-        let column = |i: usize| i % size.width;
-        let changes = |i: &usize| (flat[*i] - hot[*i]).abs() > 1e-4;
-        let changed: Vec<usize> = (0..flat.len()).filter(changes).map(column).collect();
-        assert!(changed.iter().all(|&column| column >= 32), "hot pixels change {changed:?}");
-        assert!(changed.iter().any(|&column| column > 60), "hot pixels change nothing");
+        // Tiles begin at 0, 24 and 48. Every step carries changes as far as the network sees in the next one.
+        for (steps, least, first) in [(1, 0.0, 48), (3, 1e-4, 32)] {
+            let [flat, hot] = [1.6, 3.2].map(|rate| restore(size, 0, steps, map(rate)));
+            let column = |i: usize| i % size.width;
+            let changes = |i: &usize| (flat[*i] - hot[*i]).abs() > least;
+            let changed: Vec<usize> = (0..flat.len()).filter(changes).map(column).collect();
+            assert!(changed.iter().all(|&column| column >= first), "{steps} steps: {changed:?}");
+            assert!(changed.iter().any(|&column| column > 60), "hot pixels change nothing");
+        }
     }
 }

@@ -28,8 +28,8 @@ pub struct WindowConfig {
     pub state: usize,
     /// Residual blocks of the recurrent cells.
     pub cell_blocks: usize,
-    /// Whether the stacks of the coarser levels of pre-denoiser and U-Net begin without a ReLU. With it, all
-    /// of its units can be off for every input, and these levels learn no more.
+    /// Whether the stacks of the coarser levels of pre-denoiser and U-Net begin without a ReLU. Behind one,
+    /// all units can be off for every input, and these levels learn no more.
     #[serde(default, skip_serializing_if = "is_default")]
     #[schemars(skip_serializing_if = "never")]
     pub linear_entries: bool,

@@ -153,7 +153,24 @@ impl SensorMix {
             sensor.frames_summed = frames;
             sensor.validate()?;
         }
+        refuse_dark_map(&sensor, "data.sensor")?;
         Ok(sensor.as_read())
+    }
+}
+
+/// Refuses a sensor with a map of dark rates: what is drawn has a size of its own, and no place on the
+/// sensor.
+///
+/// # Errors
+/// [`Error`] that names `key`, if there is a map.
+pub(crate) fn refuse_dark_map(sensor: &Sensor, key: &str) -> Result<()> {
+    match &sensor.defects.dark_map {
+        None => Ok(()),
+        Some(map) => Err(Error::request(
+            format!("the sensor `{}` has a map of dark rates, {map}", sensor.name),
+            key,
+            "leave `dark_map` out of a copy of its file; `dark_spread` and `hot_fraction` draw rates",
+        )),
     }
 }
 

@@ -6,7 +6,7 @@ use super::pack::Pack;
 use qudi_core::Light;
 use qudi_core::random::{Domain, Streams, uniform};
 use qudi_core::restorer::Acquisition;
-use qudi_core::sensor::Sensor;
+use qudi_core::sensor::{Defects, Sensor};
 use qudi_core::{Camera, Error, Frame, Result, RollingShutter, Size};
 use qudi_sim::scene::{Procedural, ProceduralScene, StillMotion, still_scene};
 use rand::Rng;
@@ -76,7 +76,10 @@ impl Dataset {
         let sensor = self.sensors[at].clone();
         let light = Light { ppp: self.config.sensor[at].ppp.at(uniform(&mut rng)), mean_level };
         let seed = rng.next_u64();
-        let mut camera = Camera::new(&sensor, frames[0].size, light, seed)?;
+        // A crop may lie anywhere on the sensor: no pattern of defects is to be learnt.
+        let defects = Defects { seed, ..sensor.defects.clone() };
+        let exposed = Sensor { defects, ..sensor.clone() };
+        let mut camera = Camera::new(&exposed, frames[0].size, light, seed)?;
         let mut shutter = RollingShutter::new(&sensor);
         let (mut truth, mut counts) = (Vec::new(), Vec::new());
         for (t, frame) in (0..).zip(&frames) {
@@ -84,7 +87,7 @@ impl Dataset {
             counts.push(camera.expose(t, &[&seen])?);
             truth.push(seen);
         }
-        let acquisition = Acquisition::new(sensor, light.ppp, mean_level)?.with_seed(seed);
+        let acquisition = acquisition(&sensor, light.ppp, mean_level)?.with_seed(seed);
         Ok(Sample { truth, counts, acquisition })
     }
 
@@ -148,6 +151,17 @@ impl Dataset {
         let mean = frames.iter().map(Frame::mean).sum::<f64>() / frames.len() as f64;
         (frames, mean)
     }
+}
+
+/// Returns what is known of a capture, as `restore` and `eval` know it: cross-talk and afterpulses counted as
+/// light, a pedestal as dark electrons.
+///
+/// # Errors
+/// [`Error`] if the sensor has no gain at this light.
+pub(crate) fn acquisition(sensor: &Sensor, ppp: f64, mean_level: f64) -> Result<Acquisition> {
+    let above_pedestal = Sensor { offset: 0.0, ..sensor.clone() };
+    let acquisition = Acquisition::new(above_pedestal, ppp, mean_level)?;
+    acquisition.without_echoes()?.with_pedestal(sensor.offset)
 }
 
 fn square(side: usize) -> Size {

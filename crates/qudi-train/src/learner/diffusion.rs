@@ -112,6 +112,13 @@ impl Learner for Diffusion {
     fn learns(&self, recipe: &Recipe) -> Vec<bool> {
         learning(self, recipe)
     }
+
+    fn idle_layers(recipe: &Recipe) -> &'static [&'static str] {
+        let train = &recipe.train;
+        let is_first = train.noise_start_fraction() >= 1.0;
+        let is_measured_again = !is_first && !train.ablate.removes(Part::ForwardModel);
+        if is_measured_again { &[] } else { &["pre.simulated_in"] }
+    }
 }
 
 /// Bursts to learn from.

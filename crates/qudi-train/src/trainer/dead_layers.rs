@@ -6,17 +6,22 @@ use qudi_core::Result;
 use qudi_kernels::is_flex;
 use qudi_layers::tensor::read;
 use rayon::prelude::*;
+use std::collections::HashMap;
 
-/// The largest mean gradient of a dead layer, over the largest of all layers: after some hundred steps
-/// without gradient the running mean is below it.
+/// The largest mean gradient of a dead layer, over the largest of its part: after some hundred steps without
+/// gradient the running mean is below it.
 const NONE: f32 = 1e-9;
+
+/// The steps after which layers are judged: what lies before layers that begin at zero has no gradient in the
+/// first ones.
+pub(super) const FIRST_STEPS: u64 = 10;
 
 /// Returns the names of the layers whose weights no gradient reaches, in the order of the network. Parts of a
 /// network (what names begin with) that no gradient reaches at all are left out: the recipe gives them
 /// nothing to learn from.
 ///
 /// `means` are the running means of the gradients of all parameters, which `names` names; `learns` says
-/// which of them learn.
+/// which of them can learn.
 ///
 /// # Errors
 /// [`Error`](qudi_core::Error) if the device fails.
@@ -32,16 +37,25 @@ pub(super) fn dead_layers(
         means.iter().map(largest).collect()
     };
     let largest = read(Tensor::cat(largest, 0))?;
-    let bound = NONE * largest.iter().copied().fold(0.0, f32::max);
-    let has_gradient = |at: usize| learns[at] && largest[at] > bound;
-    let part = |name: &str| name.split('.').next().map(str::to_owned);
-    let of_layers = || names.iter().enumerate().filter(|(_, name)| name.ends_with(".weight"));
-    let learning: Vec<_> =
-        of_layers().filter(|(at, _)| has_gradient(*at)).map(|(_, name)| part(name)).collect();
-    let is_dead =
-        |at: usize, name: &str| learns[at] && !has_gradient(at) && learning.contains(&part(name));
-    let dead = of_layers().filter(|(at, name)| is_dead(*at, name));
-    Ok(dead.map(|(_, name)| name.trim_end_matches(".weight").to_owned()).collect())
+    let layers: Vec<(&str, f32)> = (0..names.len())
+        .filter(|&at| learns[at])
+        .filter_map(|at| Some((names[at].strip_suffix(".weight")?, largest[at])))
+        .collect();
+    let mut of_parts: HashMap<&str, f32> = HashMap::new();
+    for &(name, largest) in &layers {
+        let of_part = of_parts.entry(part(name)).or_default();
+        *of_part = of_part.max(largest);
+    }
+    let is_dead = |(name, largest): &&(&str, f32)| {
+        let of_part = of_parts[part(name)];
+        of_part > f32::MIN_POSITIVE / NONE && *largest <= NONE * of_part
+    };
+    Ok(layers.iter().filter(is_dead).map(|(name, _)| (*name).to_owned()).collect())
+}
+
+/// Returns the part of the network that a layer belongs to.
+fn part(name: &str) -> &str {
+    name.split('.').next().unwrap_or(name)
 }
 
 #[cfg(test)]
@@ -52,7 +66,7 @@ mod tests {
     #[test]
     fn layers_without_gradient_are_named_and_idle_parts_are_not() {
         let device = Device::flex();
-        let layers: [(&str, [f32; 2], bool); 7] = [
+        let layers: [(&str, [f32; 2], bool); 9] = [
             ("unet.enter.weight", [0.0, -2.0], true),
             ("unet.enter.bias", [0.0, 0.0], true),
             ("unet.out.weight", [0.0, 0.0], true),
@@ -60,6 +74,9 @@ mod tests {
             ("unet.frozen.weight", [0.0, 0.0], false),
             ("flow.first.weight", [0.0, 0.0], true),
             ("fusion.first.weight", [1e-6, 0.0], true),
+            // A part that learns seldom has small means, and none that is dead.
+            ("gate.first.weight", [1e-12, 0.0], true),
+            ("gate.last.weight", [1e-15, 0.0], true),
         ];
         let names: Vec<String> = layers.iter().map(|(name, ..)| (*name).to_owned()).collect();
         let means: Vec<_> =

@@ -3,7 +3,7 @@
 use burn::tensor::Tensor;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
-/// The loss and its terms, each the mean over a step.
+/// The loss and its terms, each the mean over a step; of a term, over the batches that have it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LossValues {
     /// The weighted sum.
@@ -18,15 +18,19 @@ impl LossValues {
         self.terms.iter().find(|(term, _)| *term == name).map_or(0.0, |(_, value)| *value)
     }
 
-    /// Adds a share of the losses of the same network.
-    pub(super) fn add(&mut self, other: &Self, share: f64) {
-        self.total += share * other.total;
-        for (name, value) in &other.terms {
-            match self.terms.iter_mut().find(|(term, _)| term == name) {
-                Some((_, sum)) => *sum += share * value,
-                None => self.terms.push((name, share * value)),
+    /// Returns the mean of losses of the same network.
+    pub(super) fn mean(losses: &[Self]) -> Self {
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
+        let totals: Vec<f64> = losses.iter().map(|loss| loss.total).collect();
+        let mut terms: Vec<(&'static str, Vec<f64>)> = Vec::new();
+        for &(name, value) in losses.iter().flat_map(|loss| &loss.terms) {
+            match terms.iter_mut().find(|(term, _)| *term == name) {
+                Some((_, values)) => values.push(value),
+                None => terms.push((name, vec![value])),
             }
         }
+        let terms = terms.into_iter().map(|(name, values)| (name, mean(&values)));
+        Self { total: mean(&totals), terms: terms.collect() }
     }
 }
 
@@ -63,5 +67,20 @@ impl Serialize for LossValues {
             map.serialize_entry(name, value)?;
         }
         map.end()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn terms_are_means_over_the_batches_that_have_them() {
+        let of = |total, terms: &[_]| LossValues { total, terms: terms.to_vec() };
+        let losses =
+            [of(3.0, &[("prediction", 1.0), ("flow", 6.0)]), of(1.0, &[("prediction", 2.0)])];
+        let mean = LossValues::mean(&losses);
+        assert_eq!(mean, of(2.0, &[("prediction", 1.5), ("flow", 6.0)]));
+        assert_eq!(LossValues::mean(&[]), LossValues::default());
     }
 }
