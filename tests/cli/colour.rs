@@ -114,6 +114,27 @@ fn three_full_planes_are_restored_together() {
     run(&folder, &format!("{restore} -o one.npy --method average --channel 2"));
     assert_eq!(npy_shape(&folder.join("one.npy")), format!("({FRAMES}, {HEIGHT}, {WIDTH})"));
     refused(&folder, &format!("{restore} -o x.npy --cfa rggb"), &["every pixel has all colours"]);
+    // An interrupted run goes on with the same balance, and measures no colours of the run before.
+    let pictures = format!("{restore} -o pictures --method average --wb");
+    run(&folder, &format!("{pictures} 1,1,1"));
+    std::fs::remove_file(folder.join("pictures/frame_000010.png")).unwrap();
+    refused(&folder, &format!("{pictures} 2,1,0.2"), &["white_balance"]);
+    for measured in ["--chi-map m.npy", "--side-by-side s.png"] {
+        let flag = measured.split(' ').next().unwrap();
+        refused(&folder, &format!("{pictures} 1,1,1 {measured}"), &[flag]);
+    }
+    run(&folder, &format!("{pictures} 1,1,1"));
+}
+
+/// One plane of a recorded mosaic is gray, and stays it once it is converted.
+#[test]
+fn planes_of_a_mosaic_are_converted_to_gray() {
+    let folder = exposed("colour-plane", "rggb");
+    run(&folder, "convert m.npy --channel 1 -o plane.npy");
+    let info: serde_json::Value = document(&folder, "info plane.npy --json");
+    assert_eq!(info["colours"], serde_json::Value::Null, "{info}");
+    run(&folder, "restore plane.npy -o p.npy --method average");
+    assert_eq!(npy_shape(&folder.join("p.npy")).matches(',').count(), 2);
 }
 
 #[test]

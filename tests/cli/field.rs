@@ -105,6 +105,18 @@ fn aligns_sums_by_itself_where_things_move() {
         let text = said(&folder, &format!("{restore} {other} -o other.npy -f"));
         assert!(!text.contains("motion is followed"), "{other}: {text}");
     }
+    // A light is given per frame as `info` prints it, although the sums that are aligned are shorter.
+    let info: Value =
+        serde_json::from_str(&run(&folder, "info c.npy --sensor swissspad2 --json")).unwrap();
+    let ppp = info["ppp"]["incident"].as_f64().unwrap();
+    run(&folder, &format!("{restore} --method qbp -o given --ppp {ppp}"));
+    let ppp_of = |name: &str| {
+        let manifest = std::fs::read_to_string(folder.join(name).join("manifest.json")).unwrap();
+        let manifest: Value = serde_json::from_str(&manifest).unwrap();
+        manifest["settings"]["ppp"].as_f64().unwrap()
+    };
+    let ratio = ppp_of("given") / ppp_of("aligned");
+    assert!((ratio - 1.0).abs() < 0.02, "{ratio}");
     // All frames are the same, also when an interrupted run is continued.
     run(&folder, "restore c.npy --sensor swissspad2 --method qbp -o all");
     let pictures = listing(&folder.join("all"));
@@ -134,6 +146,31 @@ fn clips_repeat_frames_and_rows_roll() {
     assert_ne!(read("still.npy"), read("rolls.npy"));
     refused(&folder, "simulate scene:text -o s.npy --frames-per-image 3", &["--frames-per-image"]);
     refused(&folder, "simulate clip.npy -o s.npy --rolling-shutter 2", &["rolling_shutter"]);
+}
+
+/// Dark rates per second mean the same to binary frames and to a file of their sums.
+#[test]
+fn rates_per_second_are_those_of_binary_frames() {
+    let folder = scratch("field-rates");
+    let sensor = "--sensor swissspad2 --set sensor.fps=100000 --set sensor.dark=\"20000/s\"";
+    let simulate = "simulate scene:text -o b.npy --frames 70 --size 32x32 --ppp 0.1 --seed 1";
+    run(&folder, &format!("{simulate} {sensor}"));
+    run(&folder, "convert b.npy -o c.npy --sum 7");
+    let rates: Vec<u8> = [20000f32; 32 * 32].iter().flat_map(|rate| rate.to_le_bytes()).collect();
+    std::fs::write(folder.join("dcr.npy"), npy_bytes("<f4", "(32, 32)", &rates)).unwrap();
+    let options = "--dcr dcr.npy --mask none --method mle";
+    run(&folder, &format!("restore b.npy --sum 7 {options} -o from-b.npy"));
+    run(&folder, &format!("restore c.npy {options} -o from-c.npy"));
+    let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
+    assert_eq!(read("from-b.npy"), read("from-c.npy"));
+    let dark = "simulate scene:text -o dark.npy --frames 70 --size 32x32 --ppp 1e-6 --seed 2";
+    run(&folder, &format!("{dark} {sensor}"));
+    run(&folder, "convert dark.npy -o sums.npy --sum 7");
+    let maps = ["dark", "sums"].map(|name| {
+        run(&folder, &format!("calibrate {name}.npy -o {name}.toml --hot 30000/s"));
+        [read(&format!("{name}.dark.npy")), read(&format!("{name}.bad.npy"))]
+    });
+    assert!(maps[0] == maps[1], "maps differ");
 }
 
 #[test]

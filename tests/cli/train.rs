@@ -209,7 +209,7 @@ fn runs_resume_and_are_never_lost() {
     let wide = format!(
         "train diffusion.toml -o wide --init run/weights.safetensors --set network.unet.width=16 {QUICK_SETTINGS}"
     );
-    refused(&folder, &wide, &["other sizes"]);
+    refused(&folder, &wide, &["other values of network.unet.width"]);
     let other =
         format!("train regression.toml -o other --init run/weights.safetensors {QUICK_SETTINGS}");
     refused(&folder, &other, &["weights of a diffusion"]);

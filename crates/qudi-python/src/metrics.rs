@@ -37,12 +37,12 @@ pub(crate) struct Lpips(Network);
 impl Lpips {
     /// Reads the weights of `lpips-vgg` or `lpips-alex` from a folder, or from where Burn keeps them.
     #[new]
-    fn new(kind: &str, folder: Option<PathBuf>) -> PyResult<Self> {
-        let load = || {
+    fn new(py: Python<'_>, kind: &str, folder: Option<PathBuf>) -> PyResult<Self> {
+        let load = move || {
             let kind = PerceptualKind::by_name(kind)?;
             Network::load(kind, folder.as_deref(), &Device::flex())
         };
-        let network = load().map_err(|error| exception(error.into()))?;
+        let network = py.detach(load).map_err(|error| exception(error.into()))?;
         network.map(Self).ok_or_else(|| PyValueError::new_err("no network is named"))
     }
 

@@ -164,12 +164,23 @@ def test_calibrating(tmp_path):
     assert np.load(tmp_path / "camera.bad.npy")[5, 7] != 0
     with pytest.raises(FileExistsError, match="overwrite=True"):
         qs.calibrate(dark, tmp_path / "camera.toml", sensor="swissspad2")
+    last = np.moveaxis(dark, 0, -1)
+    qs.calibrate(last, tmp_path / "other.toml", sensor="swissspad2", axes="hwt")
+    maps = [np.load(tmp_path / f"{name}.dark.npy") for name in ("camera", "other")]
+    assert np.array_equal(*maps)
 
 
 def test_a_look_shows_itself(npy):
     look = qs.look(npy, sensor="qudi-paper", bits=3)
     assert "<html" in look.html and look.info["frames"] == 11
     assert look._repr_html_().startswith("<iframe srcdoc=")
+
+
+def test_options_of_an_opened_array_apply_once(bits):
+    given = {"sum": 7, "start": 7, "sensor": "swissspad2"}
+    look = qs.look(qs.open(bits, **given))
+    assert look.info["frames"] == len(qs.open(bits, **given)) == 10
+    assert qs.look(bits, **given).info["frames"] == 10
 
 
 def test_writing(tmp_path, counts, bits, restored):
@@ -221,6 +232,8 @@ def test_training_is_a_loop(tmp_path):
     # The run was some steps ahead of the loop.
     steps = [event["step"] for event in qs.train(None, tmp_path / "run", resume=True) if event["kind"] == "step"]
     assert 1 < steps[0] < 25 and steps == list(range(steps[0], 31))
+    anew = list(qs.train("tiny", tmp_path / "run", settings={"train.steps": 2}, force=True))
+    assert [(event["kind"], event["step"]) for event in anew[:2]] == [("validation", 0), ("step", 1)]
 
 
 def test_versions(capsys):

@@ -27,7 +27,7 @@ pub(crate) struct Network {
     #[arg(long, value_name = "NAME", groups = [OWN, DIFFUSION])]
     sampler: Option<SamplerName>,
     /// qudi-diffusion: passes; each after the first one finds the motion between the frames that the one
-    /// before restored, and corrects them: 2 take 1.6 times as long [default: 1]
+    /// before restored, and corrects them: 2 take 1.6 to 1.8 times as long [default: 1]
     #[arg(long, value_name = "N", groups = [OWN, DIFFUSION], allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=10))]
     passes: Option<usize>,
     /// qudi-diffusion: what finds the motion between frames [default: matched, if the weights can follow it]
@@ -174,7 +174,7 @@ impl SpacingName {
 enum FlowName {
     /// Patches, matched on the processor in the counts of all frames and on better frames
     Matched,
-    /// The network, as in the paper: less exact, in three quarters of the time
+    /// The network, as in the paper: less exact, in about 0.7 of the time
     Learnt,
 }
 

@@ -9,7 +9,7 @@ use qudi_core::windows::LONGEST_HALF;
 use qudi_io::capture::{Capture, Summary};
 
 /// The light as options give it.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct LightOverrides {
     /// Incident photons per pixel and output frame.
     pub(crate) ppp: Option<f64>,

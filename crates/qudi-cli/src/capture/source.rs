@@ -89,7 +89,7 @@ fn known_sensor(capture: &Capture) -> Result<Option<Sensor>> {
         (None, Some(preset)) => {
             let mut sensor = Sensor::load(preset)?;
             // The rate of this capture, where the file knows it.
-            sensor.fps = about.fps.or(sensor.fps);
+            sensor.fps = about.exposure_rate().or(sensor.fps);
             Ok(Some(sensor))
         }
         (None, None) => Ok(None),

@@ -29,11 +29,17 @@ pub(crate) fn recipe_keys() -> Vec<(Documented, Vec<&'static str>)> {
     let others = keys_of(&schema, "").into_iter();
     keys.extend(others.filter(|key| key.name != "network"));
     let set: Vec<_> = recipe_names().map(|name| (name, set_by(name))).collect();
+    let names: Vec<String> = keys.iter().map(|key| key.name.clone()).collect();
     let with_recipes = |key: Documented| {
         let below = format!("{}.", key.name);
+        // `network.flow` is a list in one kind of network and a table, whose keys have rows, in another.
+        let has_rows_below = names.iter().any(|name| name.starts_with(&below));
         let own = |name: &str| !key.name.starts_with("network.") || Method::by_name(name).is_none();
         let sets = |(name, set): &&(&str, Vec<String>)| {
-            own(name) && set.iter().any(|set| *set == key.name || set.starts_with(&below))
+            own(name)
+                && set
+                    .iter()
+                    .any(|set| *set == key.name || (!has_rows_below && set.starts_with(&below)))
         };
         let recipes = set.iter().filter(sets).map(|(name, _)| *name).collect();
         (key, recipes)

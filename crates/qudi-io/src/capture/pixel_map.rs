@@ -44,7 +44,8 @@ pub(crate) fn plan(
         let rates = load_rates(capture, path)?;
         let hot = (0..rates.data.len()).filter(|&i| rates.data[i] > HOT_PER_SECOND).collect();
         named = Some(BadPixels { hot, ..BadPixels::default() });
-        if let Some(fps) = capture.info.fps.or(sensor.and_then(|sensor| sensor.fps)) {
+        let rate = capture.info.exposure_rate();
+        if let Some(fps) = rate.or(sensor.and_then(|sensor| sensor.fps)) {
             capture.dark = Some(rates.data.iter().map(|rate| rate / fps as f32).collect());
         } else {
             note_unknown_rate(&mut capture.info);

@@ -90,6 +90,13 @@ pub struct Packing {
 }
 
 impl CaptureInfo {
+    /// Returns exposures per second, if the file says: of binary frames where counts are sums of them, which
+    /// dark rates are told of.
+    pub fn exposure_rate(&self) -> Option<f64> {
+        let summed = self.max_count.filter(|_| self.binary).unwrap_or(1);
+        self.fps.map(|fps| fps * f64::from(summed))
+    }
+
     /// Returns true if a record next to the file describes it.
     pub fn is_recorded(&self) -> bool {
         self.reasons.iter().any(|reason| reason == RECORD)

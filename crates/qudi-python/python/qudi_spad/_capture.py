@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import json
+import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy.typing as npt
 from . import _native
 from ._arguments import flags
 from ._sensor import Sensor
-from ._source import Input, source_of
+from ._source import Input, ordered, source_of
 
 
 class Capture:
@@ -32,8 +33,11 @@ class Capture:
         The sensor that took it, if the record or the format tells.
     """
 
-    def __init__(self, path: str, options: dict[str, object], source: _native.Source | None = None) -> None:
-        self._path, self._options, self._source = path, options, source
+    def __init__(
+        self, path: str, options: dict[str, object], source: _native.Source | None = None, array: Any = None
+    ) -> None:
+        # The array is what is behind the source, its axes in order; none of files and streams.
+        self._path, self._options, self._source, self._array = path, options, source, array
         arguments = ["restore", *flags(options), "--output=-", "--", path]
         self._native = _native.Capture(arguments, source)
         self._info: dict[str, Any] = json.loads(self._native.info())
@@ -93,7 +97,7 @@ class Capture:
             If there are not so many frames, or a sum could exceed 16 bits.
         """
         summed = int(self._info["summed"]) * frames
-        return Capture(self._path, {**self._options, "sum": summed}, self._source)
+        return Capture(self._path, {**self._options, "sum": summed}, self._source, self._array)
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -168,8 +172,11 @@ def open(path: Input, /, **options: object) -> Capture:
         If it cannot be read.
     """
     options = dict(options)
+    array = path._array if isinstance(path, Capture) else None
+    if not isinstance(path, (Capture, str, os.PathLike, Iterator)):
+        path = array = ordered(path, options)
     name, source = source_of(path, options)
-    return Capture(name, options, source)
+    return Capture(name, options, source, array)
 
 
 def read(path: Input, /, **options: object) -> npt.NDArray[Any]:

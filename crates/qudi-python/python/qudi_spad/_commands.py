@@ -18,7 +18,7 @@ from ._arguments import flags, settings
 from ._capture import Capture
 from ._messages import messages, result, start
 from ._sensor import Sensor
-from ._source import Input, source_of
+from ._source import Input, ordered
 
 
 @dataclass(frozen=True)
@@ -141,13 +141,21 @@ class TrainingRun:
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         metrics = self.output / "metrics.jsonl"
-        seen = metrics.stat().st_size if metrics.exists() else 0
+        before = metrics.stat() if metrics.exists() else None
+        seen = before.st_size if before else 0
+        goes_on = "--resume" in self._arguments
         for _kind, _value in messages(start(self._arguments), patience=600.0):
             if not metrics.exists():
                 continue
             with metrics.open("rb") as lines:
-                # A run that goes on drops the steps after its last state.
-                seen = min(seen, lines.seek(0, os.SEEK_END))
+                end = lines.seek(0, os.SEEK_END)
+                is_other = before is not None and os.fstat(lines.fileno()).st_ino != before.st_ino
+                if goes_on:
+                    # The steps after the last state were dropped.
+                    seen = min(seen, end)
+                elif end < seen or is_other:
+                    # A run in place of another one writes a file of its own.
+                    seen, before = 0, None
                 lines.seek(seen)
                 for line in lines:
                     if line.endswith(b"\n"):
@@ -206,10 +214,19 @@ _settings = settings
 def _file(capture: Input, options: dict[str, object], folder: str) -> tuple[str, dict[str, object]]:
     """Returns the path of a capture, which is written if it is in memory only, and its options."""
     given = dict(options)
-    path, source = source_of(capture, given)
-    if source is None:
-        return path, given
-    array = np.asarray(capture[:] if isinstance(capture, Capture) else capture)
+    if isinstance(capture, (str, os.PathLike)):
+        return str(os.fspath(capture)), given
+    if isinstance(capture, Capture) and capture._source is None:
+        return capture._path, {**capture._options, **given}
+    if isinstance(capture, Capture) and capture._array is not None:
+        array, given = capture._array, {**capture._options, **given}
+    elif isinstance(capture, Capture):
+        # A stream is read as it was opened.
+        array = capture[:]
+    elif isinstance(capture, Iterator):
+        array = np.stack([np.asarray(frame) for frame in capture])
+    else:
+        array = ordered(capture, given)
     path = os.path.join(folder, "capture.npy")
-    np.save(path, array)
+    np.save(path, np.asarray(array))
     return path, given

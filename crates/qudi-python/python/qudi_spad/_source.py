@@ -37,14 +37,7 @@ def source_of(capture: Input, options: dict[str, object]) -> tuple[str, _native.
 
 def array_source(array: Any, options: dict[str, object]) -> _native.Source:
     """Makes the source of anything with a shape, a dtype and slices, whose frames are fetched when they are read."""
-    if not (hasattr(array, "shape") and hasattr(array, "dtype") and hasattr(array, "__getitem__")):
-        array = np.asarray(array)
-    if not isinstance(array.dtype, np.dtype):
-        # A tensor of the CPU, whose memory is shared.
-        array = np.asarray(array) if hasattr(array, "__array__") else np.from_dlpack(array)
-    axes = options.pop("axes", None)
-    if axes is not None:
-        array = np.transpose(array, _order(str(axes), len(array.shape)))
+    array = ordered(array, options)
     shape = [int(extent) for extent in array.shape]
     if not shape:
         raise FormatError(
@@ -55,6 +48,19 @@ def array_source(array: Any, options: dict[str, object]) -> _native.Source:
         return np.asarray(array[first : first + count]).tobytes()
 
     return _native.Source.array(array.dtype.str, shape, fetch)
+
+
+def ordered(array: Any, options: dict[str, object]) -> Any:
+    """Returns an array with its frames first, as the option ``axes`` says, which is taken out."""
+    if not (hasattr(array, "shape") and hasattr(array, "dtype") and hasattr(array, "__getitem__")):
+        array = np.asarray(array)
+    if not isinstance(array.dtype, np.dtype):
+        # A tensor of the CPU, whose memory is shared.
+        array = np.asarray(array) if hasattr(array, "__array__") else np.from_dlpack(array)
+    axes = options.pop("axes", None)
+    if axes is not None:
+        array = np.transpose(array, _order(str(axes), len(array.shape)))
+    return array
 
 
 def _order(axes: str, rank: int) -> list[int]:

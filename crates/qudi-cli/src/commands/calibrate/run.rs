@@ -47,7 +47,7 @@ pub(crate) fn run(
     let (base, sensor) = base_sensor(args, settings, &capture)?;
     let offset = offset.or((sensor.offset > 0.0).then_some(sensor.offset));
     let gain = args.gain.or(sensor.fixed_gain());
-    let fps = capture.info().fps.or(sensor.fps);
+    let fps = capture.info().exposure_rate().or(sensor.fps);
     let hot = args.hot.as_deref().map(|text| threshold(text, fps)).transpose()?;
     let mut bar = report.bar();
     let calibration = calibrate(&mut capture, &sensor, gain, offset, hot, &mut |done, total| {

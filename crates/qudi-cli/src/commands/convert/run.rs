@@ -168,9 +168,15 @@ fn converted_sensor(capture: &Capture, options: &ReadOptions, report: &Report) -
         return None;
     };
     sensor.offset = capture.info().pedestal;
+    let moved = options.orient.is_some() || options.crop.is_some() || options.channel.is_some();
+    // A tile that is turned and cropped with the frames has an entry of its own.
+    if let Some(colour) = &mut sensor.colour
+        && (capture.filter().is_none() || moved)
+    {
+        colour.cfa = None;
+    }
     let defects = &mut sensor.defects;
     let has_maps = defects.dark_map.is_some() || defects.bad_pixels.is_some();
-    let moved = options.orient.is_some() || options.crop.is_some() || options.channel.is_some();
     if has_maps && moved {
         (defects.dark_map, defects.bad_pixels) = (None, None);
         report.warning(

@@ -134,7 +134,7 @@ fn weights(weights: &Weights) -> Result<(String, Value)> {
         1 => String::new(),
         passes => format!("; has learnt {passes} passes"),
     };
-    let preset = d.preset.as_deref().unwrap_or("own sizes");
+    let preset = d.network.preset_name().unwrap_or("own sizes");
     let mut lines = vec![
         ("network", format!("{preset}, {sizes} parameters")),
         ("window", format!("{} frames", d.window)),

@@ -4,7 +4,7 @@ use crate::args::Reading;
 use clap::{Args as ClapArgs, ValueHint};
 use std::path::PathBuf;
 
-/// A first look at a capture, in about a second: what it is, its light, a mean, one instant restored
+/// A first look at a capture, in seconds: what it is, its light, a mean, one instant restored
 ///
 /// Prints what `qudi info` does and what `qudi restore` would do, and writes one page: the mean of the
 /// capture next to one instant of it, aligned and merged.

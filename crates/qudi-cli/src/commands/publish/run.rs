@@ -8,7 +8,7 @@ use crate::weights::{Weights, sha256};
 use burn::tensor::Device;
 use qudi_baselines::import::describe;
 use qudi_core::Error;
-use qudi_core::atomic_file::PendingFile;
+use qudi_core::atomic_file::{PendingFile, refuse_taken};
 use qudi_model::checkpoint::{Precision, save};
 use qudi_model::config::NetworkKind;
 use qudi_model::diffusion::Diffusion;
@@ -37,6 +37,10 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
     let weights = Weights::File(args.weights.clone());
     let mut description = weights.describe()?;
     let parameters = description.network.parameters(&device);
+    let hash_path = path.with_extension("sha256");
+    for taken in [path, hash_path.as_path()] {
+        refuse_taken(taken, overwrite)?;
+    }
     match (description.network.kind(), args.steps) {
         (NetworkKind::Regression, Some(_)) => {
             return Err(CliError::new(
@@ -63,11 +67,7 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
     }
     let bytes = std::fs::read(path).map_err(|e| Error::io("read the weights", path, e))?;
     let hash = sha256(&bytes);
-    PendingFile::write_whole(
-        &path.with_extension("sha256"),
-        format!("{hash}\n").as_bytes(),
-        overwrite,
-    )?;
+    PendingFile::write_whole(&hash_path, format!("{hash}\n").as_bytes(), overwrite)?;
     let text = format!(
         "{}   {parameters} parameters in {} bytes\n  sha-256   {hash}\n",
         path.display(),

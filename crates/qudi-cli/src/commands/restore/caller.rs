@@ -116,7 +116,7 @@ pub(crate) fn run(
     let rendering = job.rendering.clone();
     let mut sink = Sink { receiver, map, tonemap: plan.tonemap(), rendering };
     job.run(part, &mut sink, &plan.network, report)?;
-    let results = job.results(&plan, sink.map.chi_square())?;
+    let results = job.results(&plan, sink.map.chi_square(), true)?;
     crate::capture::remarks(job.capture(), report);
     for warning in &job.warnings {
         report.warning(warning);

@@ -9,8 +9,8 @@ use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use crate::args::{Global, Shard};
 use crate::capture::{
-    AlignedCapture, Alignment, CaptureAcquisition, OtherPlanes, Source, SummedCapture, remarks,
-    warnings,
+    AlignedCapture, Alignment, CaptureAcquisition, LightOverrides, OtherPlanes, Source,
+    SummedCapture, remarks, warnings,
 };
 use crate::colour::{Rendering, behind_filter, dng_tags, is_linear};
 use crate::commands::look::strip::strip;
@@ -76,11 +76,19 @@ pub(crate) fn run(
     let map = ChiSquareMap::new(job.capture().size(), known, &job.acquisition);
     let mut map = map.behind(job.capture().filter().cloned()).with_page(page);
     let done = output.finished(part.clone());
-    if done > 0 && plan.html.is_some() && job.rendering.is_some() {
+    let measured = [
+        ("--html", plan.html.is_some()),
+        ("--chi-map", plan.chi_square_map.is_some()),
+        ("--side-by-side", plan.side_by_side.is_some()),
+    ];
+    if let Some((flag, _)) = measured.into_iter().find(|(_, asked)| *asked)
+        && done > 0
+        && job.rendering.is_some()
+    {
         let help = "leave it out, or write into another folder";
         let what =
             format!("{done} frames were restored by an earlier run, whose colours are balanced");
-        return Err(CliError::new(what, "--html", help));
+        return Err(CliError::new(what, flag, help));
     }
     let mut uncertainty = UncertaintyFile::create(&plan, job.method, job.capture(), done)?;
     let rest = part.start + done..part.end;
@@ -96,8 +104,9 @@ pub(crate) fn run(
     }
     let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(0);
     let part = part.start..part.end.min(frames);
-    let results = job.results(&plan, map.chi_square())?;
-    let complete = part == (0..frames) || output.finished(0..frames) == frames;
+    let is_whole = part == (0..frames);
+    let results = job.results(&plan, map.chi_square(), is_whole)?;
+    let complete = is_whole || output.finished(0..frames) == frames;
     output.finish(&results, complete)?;
     uncertainty.finish()?;
     if let Some(path) = &plan.chi_square_map {
@@ -172,12 +181,17 @@ impl Job {
         let summed = SummedCapture::new(opened, source)?;
         let sensor = summed.required_sensor()?;
         summed.remark_sum(report);
+        let plain_sum = summed.capture.summed();
         let mut aligned = AlignedCapture::new(summed, source, &sensor, plan.method, plan.every)?;
         aligned.remark_alignment(report);
         let capture = &mut aligned.capture;
-        let summary = plan.light.measure(capture, Some(&sensor))?;
+        // A light is given for the frames that `qudi info` tells of.
+        let share = f64::from(capture.summed()) / f64::from(plain_sum);
+        let light =
+            LightOverrides { ppp: plan.light.ppp.map(|ppp| ppp * share), ..plan.light.clone() };
+        let summary = light.measure(capture, Some(&sensor))?;
         let CaptureAcquisition { acquisition, light_source } =
-            CaptureAcquisition::new(&plan.light, capture, &sensor, &summary)?;
+            CaptureAcquisition::new(&light, capture, &sensor, &summary)?;
         let warnings = warnings::of_capture(capture, &summary, Some(&sensor));
         let saturated = warnings::saturation(capture, &summary, Some(&sensor)).is_some();
         let rendering = rendering(plan, capture, &summary, &acquisition)?;
@@ -272,6 +286,9 @@ impl Job {
         if is_full_colour(capture) {
             settings["full_colour"] = json!(true);
             settings["gray"] = json!(plan.luma_alone);
+            if let Some(rendering) = &self.rendering {
+                settings["white_balance"] = json!(rendering.gains.0);
+            }
         }
         if let Some(filter) = capture.filter() {
             settings["gray"] = json!(plan.luma_alone);
@@ -289,8 +306,14 @@ impl Job {
         Ok(settings)
     }
 
-    /// Returns what is known of the pictures once they are made, and adds what makes them doubtful.
-    pub(super) fn results(&mut self, plan: &Plan, chi_square: Option<f64>) -> Result<Value> {
+    /// Returns what is known of the pictures once they are made, and adds what makes them doubtful. The
+    /// misfit of a part says nothing of the others: it is told, but is no result.
+    pub(super) fn results(
+        &mut self,
+        plan: &Plan,
+        chi_square: Option<f64>,
+        is_whole: bool,
+    ) -> Result<Value> {
         let own = self
             .method
             .as_own()
@@ -298,11 +321,15 @@ impl Job {
             .transpose()?;
         let mode = own.map(|own| own.mode(&plan.network));
         let sensor = &self.acquisition.sensor;
-        self.warnings.extend(warnings::of_chi_square(chi_square, sensor, self.saturated));
+        let of_whole = chi_square.filter(|_| is_whole);
+        let misfit = warnings::of_chi_square(chi_square, sensor, self.saturated);
+        let before = self.warnings.len();
+        self.warnings.extend(misfit);
+        let warnings = if is_whole { &self.warnings[..] } else { &self.warnings[..before] };
         Ok(json!({
-            "chi_square": chi_square,
+            "chi_square": of_whole,
             "mode": mode,
-            "warnings": self.warnings,
+            "warnings": warnings,
             "notes": self.capture().info().notes,
             "findings": self.capture().findings(),
         }))

@@ -183,6 +183,6 @@ fn dead_text(layers: &[String]) -> String {
     };
     format!(
         "no gradient reaches {named}{others}: these layers learn no more (all units are off); \
-         start again with a lower train.lr or a longer train.warmup"
+         start again with network.linear_entries=true, where the network has it, or a lower train.lr"
     )
 }
