@@ -120,6 +120,12 @@ fn networks_are_chosen_by_method_or_weights() {
     assert!(default == regression && said.contains("(regression) on cpu"), "{said}");
     let (diffusion, said) = restored("--method qudi-diffusion");
     assert!(diffusion != regression && said.contains("(diffusion in 1 step) on cpu"), "{said}");
+    let (corrected, said) =
+        restored("--method qudi-diffusion --correct --passes 2 --uncertainty u.npy");
+    assert!(said.contains("(diffusion in 1 step and 2 passes, corrected) on cpu"), "{said}");
+    assert!(corrected != diffusion && corrected != regression);
+    let (again, said) = restored("--method qudi-diffusion --correct --passes 2 --json");
+    assert!(again == corrected && said.contains("correction_sha256"), "{said}");
     // One step is the mean of all pictures that fit, whatever the noise; more steps draw one of them.
     let drawn = |options: &str| restored(&format!("--method qudi-diffusion {options}")).0;
     assert!(diffusion == drawn("--steps 1 --seed 7"));
@@ -128,6 +134,11 @@ fn networks_are_chosen_by_method_or_weights() {
     assert!(said.contains("(diffusion in 1 step) on cpu"), "{said}");
     let with = |options: &str| format!("restore b.npy -o refused.npy {options}");
     refused(&folder, &with("--method qudi-regression --steps 2"), &["--method qudi-diffusion"]);
+    let corrected = |options: &str| with(&format!("--method qudi-diffusion --correct {options}"));
+    refused(&folder, &with("--correct"), &["--method qudi-diffusion"]);
+    refused(&folder, &corrected("--steps 2"), &["2 steps", "--correct"]);
+    refused(&folder, &corrected("--samples 2"), &["2 samples", "--correct"]);
+    refused(&folder, &corrected("--weights w.safetensors"), &["than `window`", "--correct"]);
     refused(&folder, &with("--samples 2"), &["--method qudi-diffusion"]);
     refused(&folder, &with("--seed 2"), &["--method qudi-diffusion"]);
     refused(&folder, &with("--method qudi-diffusion --steps 0"), &["--steps"]);

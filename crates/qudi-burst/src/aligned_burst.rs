@@ -3,7 +3,7 @@
 
 use crate::burst_motion::{BurstMotion, FRAME_ERROR, FrameMotion};
 use crate::denoise::stabilized::{image, units};
-use crate::denoise::vst::VarianceStabilizer;
+use crate::denoise::vst::{Transform, VarianceStabilizer};
 use crate::merge::merged_frame::MergedFrame;
 use crate::motion::per_pixel_selection::per_pixel_selection;
 use crate::motion::reference_frames::ReferenceFrames;
@@ -11,7 +11,8 @@ use crate::patch::{PatchMotion, SIDE};
 use crate::prepared_burst::nearest;
 use crate::reference::{ReferenceEstimate, WIENER_C};
 use crate::temporal_filter::temporal_filter;
-use qudi_core::{Frame, Size};
+use qudi_core::restorer::{Acquisition, BurstView};
+use qudi_core::{Frame, Result, Size};
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
@@ -80,6 +81,30 @@ impl AlignedBurst {
         let references = ReferenceFrames::new(&motion.burst, mean_counts, FRAME_ERROR);
         let motions = frames.iter().map(|_| OnceLock::new()).collect();
         Self { motion, vst, frames, references, motions }
+    }
+
+    /// Aligns a window on frames that were restored in another way, given in image units. No reference
+    /// estimate is computed.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown.
+    ///
+    /// # Panics
+    /// If there is not one restored frame for every frame of the window, of the same size.
+    pub fn on_frames(
+        view: BurstView<'_>,
+        acquisition: &Acquisition,
+        frames: Vec<Frame>,
+    ) -> Result<Self> {
+        assert_eq!(frames.len(), view.frames.len(), "a restored frame for every frame");
+        let Acquisition { sensor, gain, .. } = acquisition;
+        sensor.dark_per_frame()?;
+        let count = view.frames.len() as u32;
+        let vst = VarianceStabilizer::new(Transform::Integral, sensor, *gain, count);
+        let motion = BurstMotion::new(view, acquisition);
+        let references = motion.references(&frames);
+        let motions = frames.iter().map(|_| OnceLock::new()).collect();
+        Ok(Self { motion, vst, frames, references, motions })
     }
 
     /// Aligns the window again on better frames, given in image units.

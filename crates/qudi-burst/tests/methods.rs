@@ -153,6 +153,13 @@ fn neighbours_are_standardized() {
         assert!((0.55..1.1).contains(&seen) && expected < 0.1, "{seen}, expected {expected}");
     }
     assert!(thrice.counts[23..].iter().chain(&thrice.expected[22..]).all(|f| deviation(f) == 0.0));
+    // Frames of another method take the place of the estimate, which is not computed then.
+    let frames = vec![still.clone(); 7];
+    let given = AlignedBurst::on_frames(burst, &acquisition, frames).unwrap();
+    let given = given.frame(2, 8, Alignments::WithPerPixel);
+    assert_eq!((&given.counts, &given.expected), (&thrice.counts, &thrice.expected));
+    assert_eq!((&given.merged, &given.noise_sigma), (&thrice.merged, &thrice.noise_sigma));
+    assert_eq!(given.reference, still);
     let own = deviation(&aligned.counts[0]);
     assert!((0.95..1.05).contains(&own), "{own}");
     let mean = aligned.counts[0].mean();

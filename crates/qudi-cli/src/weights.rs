@@ -14,24 +14,40 @@ use std::path::{Path, PathBuf};
 /// Name of built-in weights, instead of a file.
 pub(crate) const NAME: &str = "built in";
 
+/// A network in the program.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum BuiltIn {
+    /// The regression.
+    Regression,
+    /// The diffusion.
+    Diffusion,
+    /// The correction of the diffusion's means.
+    Correction,
+}
+
 /// Weights in the program (docs/model-card.md), with their SHA-256: a link to large files or a bad disk is
 /// not taken for them.
-struct BuiltIn {
+struct Embedded {
     bytes: &'static [u8],
     sha256: &'static str,
 }
 
-static REGRESSION: BuiltIn = BuiltIn {
+static REGRESSION: Embedded = Embedded {
     bytes: include_bytes!("../weights/regression.safetensors"),
     sha256: include_str!("../weights/regression.sha256"),
 };
 
-static DIFFUSION: BuiltIn = BuiltIn {
+static DIFFUSION: Embedded = Embedded {
     bytes: include_bytes!("../weights/diffusion.safetensors"),
     sha256: include_str!("../weights/diffusion.sha256"),
 };
 
-static COLOUR: BuiltIn = BuiltIn {
+static CORRECTION: Embedded = Embedded {
+    bytes: include_bytes!("../weights/correction.safetensors"),
+    sha256: include_str!("../weights/correction.sha256"),
+};
+
+static COLOUR: Embedded = Embedded {
     bytes: include_bytes!("../weights/colour.safetensors"),
     sha256: include_str!("../weights/colour.sha256"),
 };
@@ -40,7 +56,7 @@ static COLOUR: BuiltIn = BuiltIn {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Weights {
     /// The program.
-    BuiltIn(NetworkKind),
+    BuiltIn(BuiltIn),
     /// A file.
     File(PathBuf),
 }
@@ -49,7 +65,9 @@ impl Weights {
     /// Reads their description.
     pub(crate) fn describe(&self) -> Result<Description> {
         Ok(match self {
-            Self::BuiltIn(kind) => describe_bytes(built_in(*kind).verified()?, Path::new(NAME))?,
+            Self::BuiltIn(network) => {
+                describe_bytes(network.embedded().verified()?, Path::new(NAME))?
+            }
             Self::File(path) => describe(path)?,
         })
     }
@@ -57,8 +75,8 @@ impl Weights {
     /// Reads the network onto `device`.
     pub(crate) fn load<N: Network>(&self, device: &Device) -> Result<(N, Description)> {
         Ok(match self {
-            Self::BuiltIn(kind) => {
-                load_bytes(built_in(*kind).verified()?, Path::new(NAME), device)?
+            Self::BuiltIn(network) => {
+                load_bytes(network.embedded().verified()?, Path::new(NAME), device)?
             }
             Self::File(path) => load(path, device)?,
         })
@@ -67,7 +85,7 @@ impl Weights {
     /// Returns the SHA-256 of the whole file, in hexadecimal.
     pub(crate) fn sha256(&self) -> Result<String> {
         match self {
-            Self::BuiltIn(kind) => Ok(built_in(*kind).sha256.trim().to_owned()),
+            Self::BuiltIn(network) => Ok(network.embedded().sha256.trim().to_owned()),
             Self::File(path) => {
                 let bytes =
                     std::fs::read(path).map_err(|e| Error::io("read the weights", path, e))?;
@@ -104,14 +122,25 @@ pub(crate) fn colour_network() -> Result<ColourNetwork> {
     Ok(ColourNetwork::of_bytes(bytes, Path::new(NAME), precision, &device)?)
 }
 
-fn built_in(kind: NetworkKind) -> &'static BuiltIn {
-    match kind {
-        NetworkKind::Regression => &REGRESSION,
-        NetworkKind::Diffusion | NetworkKind::Window => &DIFFUSION,
+impl BuiltIn {
+    /// Returns the network of this kind that works by itself.
+    pub(crate) fn of(kind: NetworkKind) -> Self {
+        match kind {
+            NetworkKind::Regression => Self::Regression,
+            NetworkKind::Diffusion | NetworkKind::Window => Self::Diffusion,
+        }
+    }
+
+    fn embedded(self) -> &'static Embedded {
+        match self {
+            Self::Regression => &REGRESSION,
+            Self::Diffusion => &DIFFUSION,
+            Self::Correction => &CORRECTION,
+        }
     }
 }
 
-impl BuiltIn {
+impl Embedded {
     /// Returns the bytes if they are whole.
     fn verified(&self) -> Result<&'static [u8]> {
         let found = sha256(self.bytes);
@@ -139,18 +168,22 @@ mod tests {
     #[test]
     fn built_in_weights_are_whole_and_small() {
         let device = Device::flex();
-        let [regression, diffusion] =
-            [NetworkKind::Regression, NetworkKind::Window].map(Weights::BuiltIn);
-        let (_, first) = regression.load::<Regression>(&device).unwrap_or_else(|e| panic!("{e:?}"));
-        let (_, second) = diffusion.load::<Window>(&device).unwrap_or_else(|e| panic!("{e:?}"));
-        for (description, preset) in [(first, "small"), (second, "window")] {
+        let [regression, correction] = [BuiltIn::Regression, BuiltIn::Correction].map(|network| {
+            let loaded = Weights::BuiltIn(network).load::<Regression>(&device);
+            loaded.unwrap_or_else(|e| panic!("{e:?}")).1
+        });
+        let diffusion = Weights::BuiltIn(BuiltIn::Diffusion).load::<Window>(&device);
+        let (_, diffusion) = diffusion.unwrap_or_else(|e| panic!("{e:?}"));
+        let all = [(regression, "small"), (diffusion, "window"), (correction, "correction")];
+        for (description, preset) in all {
             assert!(description.network.parameters(&device) <= 3_500_000);
             // Training data was under licences that let weights be published (docs/model-card.md).
             assert_eq!(description.provenance.licence, "MIT OR Apache-2.0");
             assert_eq!(description.preset.as_deref(), Some(preset));
         }
         colour_network().unwrap_or_else(|e| panic!("{e:?}"));
-        let all = [&REGRESSION, &DIFFUSION, &COLOUR].map(|weights| weights.bytes.len());
+        let all =
+            [&REGRESSION, &DIFFUSION, &CORRECTION, &COLOUR].map(|weights| weights.bytes.len());
         assert!(all.iter().sum::<usize>() <= 10 << 20);
     }
 }

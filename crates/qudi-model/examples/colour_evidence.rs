@@ -175,7 +175,7 @@ fn method(number: usize) -> Result<Box<dyn Restorer>> {
     let (network, description) = load::<Regression>(&file, &device)?;
     let NetworkConfig::Regression(config) = description.network else { return Err(other()) };
     let model = Model { network, config, window: description.window, passes: 1 };
-    Ok(Box::new(RegressionRestorer::new(model, 512, precision, &device)?))
+    Ok(Box::new(RegressionRestorer::new(model, None, 512, precision, &device)?))
 }
 
 /// Exposes and restores a scene, and writes evidence, truth and weights; false if it is too dark.

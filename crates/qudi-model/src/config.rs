@@ -63,6 +63,7 @@ pub const PRESETS: &[(&str, &str)] = &[
     ("tiny", include_str!("../recipes/tiny.toml")),
     ("small", include_str!("../recipes/small.toml")),
     ("window", include_str!("../recipes/window.toml")),
+    ("correction", include_str!("../recipes/correction.toml")),
     ("paper-mini", include_str!("../recipes/paper-mini.toml")),
     ("paper", include_str!("../recipes/paper.toml")),
 ];
@@ -188,7 +189,7 @@ mod tests {
             .iter()
             .map(|(name, _)| NetworkConfig::preset(name).unwrap().multiple())
             .collect();
-        assert_eq!(multiples, [8, 32, 8, 16, 16]);
+        assert_eq!(multiples, [8, 32, 8, 32, 16, 16]);
         assert!(NetworkConfig::preset("huge").unwrap_err().to_string().contains("huge"));
     }
 

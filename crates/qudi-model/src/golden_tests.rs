@@ -7,8 +7,8 @@ mod whole;
 use crate::aligned::{Aligned, AlignedNeighbours};
 use crate::cases::{Case, File, parameter};
 use crate::init_parameters;
-use crate::regression::RegressionConfig;
 use crate::regression::input::NormalizedInput;
+use crate::regression::{FirstFrames, RegressionConfig};
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Gradients, Tensor};
 use qudi_burst::Alignments;
@@ -75,7 +75,8 @@ fn regression_config(case: &Case<'_>) -> RegressionConfig {
         ["width", "blocks", "growth", "neighbours"].map(|key| number(&pre[key]));
     let weight_channels = pre["trust"].as_u64().map_or(1, |_| number(&pre["trust"]));
     let fold = number(&config["fold"]);
-    RegressionConfig { fold, width, blocks, growth, neighbours, weight_channels }
+    let first = FirstFrames::default();
+    RegressionConfig { fold, width, blocks, growth, neighbours, weight_channels, first }
 }
 
 /// Compares the gradients of all parameters; none may be missing.

@@ -14,10 +14,10 @@ mod refinement;
 mod restorer;
 pub(crate) mod uncertainty;
 
-pub use config::RegressionConfig;
+pub use config::{FirstFrames, RegressionConfig};
 pub use network::Regression;
 pub use predenoiser::PreDenoiser;
-pub use refinement::{BurstAligner, Refinement};
+pub use refinement::{AlignmentFrames, BurstAligner, Refinement};
 pub use restorer::RegressionRestorer;
 
 /// Scale of a last layer's output that corrects an image, in sigmas of the merged frame's noise. Adam moves

@@ -278,7 +278,7 @@ fn reads_former_regressions_and_refuses_their_diffusion() {
     let (network, description) = load_bytes::<Regression>(&bytes, place, &device).unwrap();
     assert_eq!(description.network, NetworkConfig::Regression(config));
     let mut first = Vec::new();
-    network.refinement().visit(&mut FirstValues(&mut first));
+    network.refinement().unwrap().visit(&mut FirstValues(&mut first));
     assert!(first.iter().all(|&value| value == 0.25));
     network.visit(&mut FirstValues(&mut first));
     assert!(first.contains(&0.5));

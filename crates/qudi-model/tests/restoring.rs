@@ -8,9 +8,11 @@ use qudi_core::sensor::Sensor;
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::{Diffusion, DiffusionConfig, DiffusionRestorer, SampleOptions};
-use qudi_model::regression::RegressionRestorer;
+use qudi_model::regression::{FirstFrames, RegressionConfig, RegressionRestorer};
 use qudi_model::restorer::Model;
+use qudi_model::window::{Window, WindowConfig};
 use qudi_model::{ComputePrecision, init_parameters};
+use std::sync::Arc;
 
 fn acquisition(seed: u64, first_frame: u64) -> Acquisition {
     let sensor = Sensor::load("qudi-paper").unwrap();
@@ -49,16 +51,22 @@ fn restorer(options: SampleOptions, device: &Device) -> DiffusionRestorer<Diffus
     DiffusionRestorer::new(model, options, device).unwrap()
 }
 
-/// Returns a tiny regression.
-fn regression(tile: usize) -> qudi_core::Result<RegressionRestorer> {
+/// Returns the sizes of a tiny regression.
+fn regression_config() -> RegressionConfig {
     let text = include_str!("../../../tests/golden/regression.toml");
     let NetworkConfig::Regression(config) = NetworkConfig::parse(text, "regression").unwrap()
     else {
         panic!("not a regression")
     };
+    config
+}
+
+/// Returns a tiny regression.
+fn regression(tile: usize) -> qudi_core::Result<RegressionRestorer> {
+    let config = regression_config();
     let network = init_parameters(config.init(2, &Device::flex()), values);
     let model = Model { network, config, window: 11, passes: 1 };
-    RegressionRestorer::new(model, tile, ComputePrecision::F32, &Device::flex())
+    RegressionRestorer::new(model, None, tile, ComputePrecision::F32, &Device::flex())
 }
 
 fn counts(size: Size, frames: usize) -> Vec<Vec<u16>> {
@@ -116,6 +124,74 @@ fn regression_restores_frames_and_their_uncertainty() {
     }
     let error = regression(64).unwrap_err();
     assert!(error.to_string().contains("64 pixels") && error.help().is_some(), "{error}");
+}
+
+/// Returns a window network with random weights.
+fn window() -> Arc<DiffusionRestorer<Window>> {
+    let config = WindowConfig {
+        widths: [32; 3],
+        flow: [32; 3],
+        state: 32,
+        cell_blocks: 1,
+        linear_entries: true,
+    };
+    let network = config.init(1, &Device::flex());
+    let model = Model { network, config, window: 11, passes: 1 };
+    Arc::new(DiffusionRestorer::new(model, SampleOptions::default(), &Device::flex()).unwrap())
+}
+
+/// Returns a regression that corrects a window network's frames: with initial weights, or others.
+fn correction(
+    of: Option<Arc<DiffusionRestorer<Window>>>,
+    is_initial: bool,
+) -> qudi_core::Result<RegressionRestorer> {
+    let config = RegressionConfig { first: FirstFrames::Diffusion, ..regression_config() };
+    let mut network = config.init(2, &Device::flex());
+    if !is_initial {
+        network = init_parameters(network, values);
+    }
+    let model = Model { network, config, window: 11, passes: 1 };
+    RegressionRestorer::new(model, of, 512, ComputePrecision::F32, &Device::flex())
+}
+
+/// Initial weights correct nothing: but for the temporal filter, the frames are the window network's.
+#[test]
+fn frames_of_a_diffusion_are_corrected() {
+    let size = Size { height: 40, width: 56 };
+    let counts = counts(size, 4);
+    let burst = BurstView { size, frames: &counts };
+    let restored = |is_initial| {
+        let mut restorer = correction(Some(window()), is_initial).unwrap();
+        assert_eq!(restorer.name(), "qudi-diffusion");
+        restorer.restore(burst, &acquisition(1, 0)).unwrap()
+    };
+    let model = Arc::into_inner(window()).unwrap();
+    let first = { model }.restore(burst, &acquisition(1, 0)).unwrap();
+    let distance = |one: &Restored, other: &Restored| {
+        let pixels = |all: &Restored| -> Vec<f32> {
+            all.frames.iter().flat_map(|frame| frame.data.clone()).collect()
+        };
+        let (one, other) = (pixels(one), pixels(other));
+        let squares: f32 = one.iter().zip(&other).map(|(a, b)| (a - b).powi(2)).sum();
+        (squares / one.len() as f32).sqrt()
+    };
+    let (initial, corrected) = (restored(true), restored(false));
+    let [filtered, moved] = [&initial, &corrected].map(|frames| distance(frames, &first));
+    let mut other = regression(128).unwrap();
+    let other = distance(&other.restore(burst, &acquisition(1, 0)).unwrap(), &first);
+    assert!(filtered < 0.3 * other && filtered < moved, "{filtered}, {moved}, {other}");
+    assert!(corrected.std.is_some_and(|std| std.len() == 4));
+    let error = correction(None, true).unwrap_err().to_string();
+    assert!(error.contains("corrects the frames of a diffusion"), "{error}");
+    let (config, network) = {
+        let config = regression_config();
+        let network = config.init(2, &Device::flex());
+        (config, network)
+    };
+    let model = Model { network, config, window: 11, passes: 1 };
+    let both =
+        RegressionRestorer::new(model, Some(window()), 512, ComputePrecision::F32, &Device::flex());
+    assert!(both.unwrap_err().to_string().contains("restores its own"));
 }
 
 #[test]

@@ -9,6 +9,7 @@ use crate::dataset::{DataConfig, Pack, Sample, SensorMix};
 use crate::digest::Digest;
 use crate::parameters::parameters;
 use crate::recipe::{CropsConfig, Recipe};
+use burn::module::Module;
 use burst::ConditionedBurst;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::regular_file::read_limited;
@@ -18,7 +19,7 @@ use qudi_core::{Error, Frame, Result, Size};
 use qudi_layers::tensor::read as read_tensor;
 use qudi_model::aligned::{Aligned, AlignedNeighbours};
 use qudi_model::diffusion::Part;
-use qudi_model::regression::{BurstAligner, PreDenoiser};
+use qudi_model::regression::{AlignmentFrames, BurstAligner};
 use rand::{Rng, RngExt};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -147,16 +148,19 @@ struct CacheKey {
 struct AlignedKey {
     neighbours: usize,
     alignments: usize,
-    /// Hash of the weights of the refinement; none before it has learnt.
+    /// Hash of the weights that made the frames; none for the reference estimate.
     refinement: Option<String>,
 }
 
 impl AlignedKey {
     fn new(aligner: &BurstAligner) -> Result<Self> {
         let AlignedNeighbours { neighbours, alignments } = aligner.neighbours();
-        let refinement = aligner.refinement().map(|refinement| sha256(refinement.predenoiser()));
-        let (alignments, refinement) = (alignments.count(), refinement.transpose()?);
-        Ok(Self { neighbours, alignments, refinement })
+        let refinement = match aligner.frames() {
+            AlignmentFrames::ReferenceEstimate => None,
+            AlignmentFrames::Refinement(refinement) => Some(sha256(refinement.predenoiser())?),
+            AlignmentFrames::Diffusion(diffusion) => Some(sha256(diffusion.network())?),
+        };
+        Ok(Self { neighbours, alignments: alignments.count(), refinement })
     }
 }
 
@@ -171,10 +175,10 @@ impl CacheKey {
     }
 }
 
-/// Hashes the weights of a pre-denoiser.
-fn sha256(predenoiser: &PreDenoiser) -> Result<String> {
+/// Hashes the weights of a network.
+fn sha256<M: Module>(network: &M) -> Result<String> {
     let mut hash = Sha256::new();
-    for list in parameters(predenoiser) {
+    for list in parameters(network) {
         read_tensor(list)?.iter().for_each(|value| hash.update(value.to_le_bytes()));
     }
     Ok(format!("{:x}", hash.finalize()))

@@ -113,6 +113,10 @@ pub struct TrainConfig {
     #[serde(default, skip_serializing_if = "is_default")]
     #[schemars(skip_serializing_if = "never")]
     pub matched: f64,
+    /// Weights of the network `window`, whose frames are corrected. Only of the regression with
+    /// `network.first = "diffusion"`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub first: Option<String>,
     /// Steps between checkpoints.
     pub checkpoint: u64,
     /// Loss of the diffusion; the other networks have no weights to choose.

@@ -19,7 +19,7 @@ use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::diffusion::{Conditioning, Simulated};
-use qudi_model::regression::RegressionConfig;
+use qudi_model::regression::{FirstFrames, RegressionConfig};
 use qudi_model::sensor::{RESPONSE_LEVELS, SENSOR_NUMBERS};
 use qudi_model::window::WindowConfig;
 
@@ -269,6 +269,7 @@ fn regression(device: &Device) -> Result<Vec<Vec<f32>>> {
         growth: 8,
         neighbours: 4,
         weight_channels: 4,
+        first: FirstFrames::default(),
     };
     let neighbours = config.second_neighbours().count() as u32;
     let planes = |first| (first..).map(|seed| image(seed, &device));

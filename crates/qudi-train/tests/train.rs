@@ -319,6 +319,51 @@ fn refinement_keeps_its_weights_afterwards() {
     assert_eq!(weights(&whole), weights(&parts));
 }
 
+/// A correction learns on the frames of the window network that `train.first` names, and on no others.
+#[test]
+fn corrections_learn_on_the_frames_of_a_diffusion() {
+    let folder = tempfile::tempdir().unwrap();
+    let sizes = window(&[("train.steps", "1")]);
+    let save = |seed: u64, name: &str| {
+        let seed = seed.to_string();
+        let recipe = window(&[("train.seed", seed.as_str())]);
+        let path = folder.path().join(name);
+        let network = Window::init(&recipe, &Device::flex()).unwrap();
+        network.save(&sizes, &Origin::default(), &path).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    let names = [save(1, "one.safetensors"), save(2, "two.safetensors")];
+    let of = |first: &str| {
+        let changes = [("network.first", "diffusion"), ("train.first", first)];
+        let network = Regression::init(&regression(&changes), &Device::flex()).unwrap();
+        assert!(network.refinement().is_none());
+        let reports = trained_as::<Regression>(&regression(&changes), &[Device::flex()], 1).1;
+        reports.iter().map(|report| report.loss.term("uncertainty")).collect::<Vec<_>>()
+    };
+    let losses = of(&names[0]);
+    assert!(losses.iter().all(|loss| loss.is_finite()));
+    assert_eq!(losses, of(&names[0]));
+    assert_ne!(losses, of(&names[1]), "the frames of other weights");
+    // It starts from a whole regression, too, whose first pre-denoiser it does not need.
+    let whole = Regression::init(&regression(&[("train.seed", "5")]), &Device::flex()).unwrap();
+    let path = folder.path().join("whole.safetensors");
+    whole.save(&regression(&[]), &Origin::default(), &path).unwrap();
+    let recipe = regression(&[("network.first", "diffusion"), ("train.first", &names[0])]);
+    let start = Regression::load(&path, &recipe, &Device::flex()).unwrap();
+    assert_eq!(weights(&start), weights(&whole.without_refinement()));
+    let wider = [
+        ("network.first", "diffusion"),
+        ("train.first", names[0].as_str()),
+        ("network.width", "12"),
+    ];
+    let error = Regression::load(&path, &regression(&wider), &Device::flex()).unwrap_err();
+    assert!(error.to_string().contains("network.width"), "{error}");
+    let recipe = regression(&[("network.first", "diffusion"), ("train.first", "none")]);
+    let network = Regression::init(&recipe, &Device::flex()).unwrap();
+    let error = network.aligner(&recipe, &Device::flex()).unwrap_err();
+    assert!(error.to_string().contains("none"), "{error}");
+}
+
 /// The uncertainty learns from the errors of the frames, which learn nothing from it.
 #[test]
 fn uncertainty_learns_without_the_frames() {
@@ -491,10 +536,22 @@ fn regression_recipes_are_refused_by_key() {
         ("train.matched", "0.5", "train.matched"),
         ("validation.steps", "1", "validation.steps"),
         ("network.neighbours", "0", "network.neighbours"),
+        ("network.first", "diffusion", "train.first"),
+        ("network.first", "average", "network.first"),
+        ("train.first", "w.safetensors", "network.first"),
     ] {
         let error = load(key, value);
         assert!(error.contains(word), "{key}={value}: {error}");
     }
+    let changes = [
+        ("network.first", "diffusion"),
+        ("train.first", "w.safetensors"),
+        ("train.learns", "[\"refinement\"]"),
+    ];
+    let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
+    let text = include_str!("../../../tests/golden/regression.toml");
+    let error = Recipe::parse(text, "regression", &changes).unwrap_err().to_string();
+    assert!(error.contains("train.learns"), "{error}");
     assert!(Recipe::load("small", &[]).unwrap().stages().unwrap().len() == 2);
     for passes in ["0", "9"] {
         let changes = [("train.passes".to_owned(), passes.to_owned())];

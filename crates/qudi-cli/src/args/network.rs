@@ -33,6 +33,9 @@ pub(crate) struct Network {
     /// qudi-diffusion: what finds the motion between frames [default: matched, if the weights can follow it]
     #[arg(long, value_name = "NAME", groups = [OWN, DIFFUSION])]
     flow: Option<FlowName>,
+    /// qudi-diffusion: correct the mean of one step once more along the counts, and predict its uncertainty
+    #[arg(long, groups = [OWN, DIFFUSION])]
+    correct: bool,
     /// qudi-diffusion: samples drawn; the result is their mean, --uncertainty their standard deviation
     /// [default: 1]
     #[arg(long, value_name = "K", groups = [OWN, DIFFUSION], allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
@@ -82,6 +85,7 @@ impl Network {
             spacing: self.spacing.map(SpacingName::spacing),
             sampler: self.sampler.map_or_else(Sampler::default, SamplerName::sampler),
             passes: self.passes.unwrap_or(1),
+            correct: self.correct,
             flow: self.flow.map(FlowName::source),
             samples: self.samples.unwrap_or(1),
             device: self.device.clone().unwrap_or_else(|| "auto".to_owned()),

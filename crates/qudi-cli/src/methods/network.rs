@@ -7,17 +7,19 @@ use super::trained::check;
 use crate::device;
 use crate::error::{CliError, Result};
 use crate::memory::{available_bytes, check_tiles};
-use crate::weights::Weights;
+use crate::weights::{BuiltIn, Weights};
+use burn::tensor::Device;
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_model::ComputePrecision;
 use qudi_model::checkpoint::{Description, Sampling};
 use qudi_model::config::{NetworkConfig, NetworkKind};
 use qudi_model::diffusion::{Diffusion, DiffusionRestorer, FlowSource, SampleOptions};
-use qudi_model::regression::{Regression, RegressionRestorer};
+use qudi_model::regression::{FirstFrames, Regression, RegressionConfig, RegressionRestorer};
 use qudi_model::restorer::Model;
 use qudi_model::window::Window;
 use serde_json::{Value, json};
+use std::sync::Arc;
 
 /// The network that a method of this project runs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,8 +45,8 @@ impl OwnNetwork {
     pub(crate) fn new(options: &NetworkOptions, choice: NetworkChoice) -> Result<Self> {
         let weights = match (&options.own_file, choice) {
             (Some(path), _) => Weights::File(path.clone()),
-            (None, NetworkChoice::Best) => Weights::BuiltIn(NetworkKind::Regression),
-            (None, NetworkChoice::Of(kind)) => Weights::BuiltIn(kind),
+            (None, NetworkChoice::Best) => Weights::BuiltIn(BuiltIn::Regression),
+            (None, NetworkChoice::Of(kind)) => Weights::BuiltIn(BuiltIn::of(kind)),
         };
         let description = weights.describe()?;
         let kind = match choice {
@@ -65,7 +67,11 @@ impl OwnNetwork {
             passes => format!(" and {passes} passes"),
         };
         match (self.kind, self.sampling(options).steps) {
+            (NetworkKind::Regression, _) if self.corrects_diffusion() => {
+                "diffusion in 1 step, corrected".to_owned()
+            }
             (NetworkKind::Regression, _) => "regression".to_owned(),
+            (_, 1) if options.correct => format!("diffusion in 1 step{passes}, corrected"),
             (_, 1) => format!("diffusion in 1 step{passes}"),
             (_, steps) => format!("diffusion in {steps} steps{passes}"),
         }
@@ -74,6 +80,12 @@ impl OwnNetwork {
     /// Returns the kind of the network. The regression predicts its uncertainty; the diffusion has steps.
     pub(crate) fn kind(&self) -> NetworkKind {
         self.kind
+    }
+
+    /// Returns true if the network corrects the means that the built-in diffusion predicts.
+    fn corrects_diffusion(&self) -> bool {
+        let sizes = &self.description.network;
+        matches!(sizes, NetworkConfig::Regression(config) if config.first == FirstFrames::Diffusion)
     }
 
     /// Returns the sampling that is asked for; by default the one that the weights were made for.
@@ -93,6 +105,9 @@ impl OwnNetwork {
             "tile": options.tile,
             "precision": options.precision(&device::open(&options.device)?)?,
         });
+        if self.corrects_diffusion() {
+            settings["diffusion_sha256"] = json!(Weights::BuiltIn(BuiltIn::Diffusion).sha256()?);
+        }
         if self.kind.is_diffusion() {
             let sampling = self.sampling(options);
             settings["steps"] = json!(sampling.steps);
@@ -105,6 +120,10 @@ impl OwnNetwork {
             }
             if options.passes > 1 {
                 settings["passes"] = json!(options.passes);
+            }
+            if options.correct {
+                let correction = Weights::BuiltIn(BuiltIn::Correction).sha256()?;
+                settings["correction_sha256"] = json!(correction);
             }
         }
         Ok(settings)
@@ -124,19 +143,32 @@ pub(crate) fn restorer(
     if device.is_processor() {
         let Description { network, window, .. } = &own.description;
         let smallest = 4 * network.multiple();
+        let other = match (own.corrects_diffusion(), options.correct) {
+            (true, _) => Some(BuiltIn::Diffusion),
+            (false, true) => Some(BuiltIn::Correction),
+            (false, false) => None,
+        };
+        let other = other.map(|other| Weights::BuiltIn(other).describe()).transpose()?;
         check_tiles([smallest, options.tile], size, available_bytes(), |size| {
-            network.memory(size, *window)
+            let other = other.as_ref().map(|other| &other.network);
+            let networks = [Some(network), other].into_iter().flatten();
+            networks.map(|network| network.memory(size, *window)).max().unwrap_or(0)
         })?;
     }
     let precision = options.precision(&device)?;
+    let corrects = own.corrects_diffusion();
     let Description { window, passes, .. } = own.description;
     let restorer: Box<dyn Restorer> = match own.kind {
         NetworkKind::Regression => {
-            let (network, description) = own.weights.load::<Regression>(&device.device)?;
-            let NetworkConfig::Regression(config) = description.network else { unreachable!() };
-            let model = Model { network, config, window, passes };
+            let model = regression_model(&own.weights, &device.device)?;
+            let first = || first_frames(options, precision, &device.device);
+            let diffusion = corrects.then(first).transpose()?;
             let tile = options.tile;
-            Box::new(RegressionRestorer::new(model, tile, precision, &device.device)?)
+            Box::new(RegressionRestorer::new(model, diffusion, tile, precision, &device.device)?)
+        }
+        NetworkKind::Diffusion if options.correct => {
+            let what = "a correction of another network than `window`";
+            return Err(CliError::new(what, "--correct", "leave it out, or name other --weights"));
         }
         NetworkKind::Diffusion => {
             let (network, description) = own.weights.load::<Diffusion>(&device.device)?;
@@ -149,11 +181,61 @@ pub(crate) fn restorer(
             let (network, description) = own.weights.load::<Window>(&device.device)?;
             let NetworkConfig::Window(config) = description.network else { unreachable!() };
             let model = Model { network, config, window, passes };
-            let options = sample_options(&own, options, precision);
-            Box::new(DiffusionRestorer::new(model, options, &device.device)?)
+            let sampling = sample_options(&own, options, precision);
+            let diffusion = DiffusionRestorer::new(model, sampling, &device.device)?;
+            if options.correct {
+                check_correction(sampling)?;
+                let built_in = Weights::BuiltIn(BuiltIn::Correction);
+                let model = regression_model(&built_in, &device.device)?;
+                let (first, tile) = (Some(Arc::new(diffusion)), options.tile);
+                Box::new(RegressionRestorer::new(model, first, tile, precision, &device.device)?)
+            } else {
+                Box::new(diffusion)
+            }
         }
     };
     Ok((restorer, format!(" ({}) on {}", own.mode(options), device.name)))
+}
+
+/// Loads a regression.
+fn regression_model(
+    weights: &Weights,
+    device: &Device,
+) -> Result<Model<Regression, RegressionConfig>> {
+    let (network, description) = weights.load::<Regression>(device)?;
+    let Description { network: NetworkConfig::Regression(config), window, passes, .. } =
+        description
+    else {
+        unreachable!("a regression has sizes of one")
+    };
+    Ok(Model { network, config, window, passes })
+}
+
+/// Refuses to correct anything but the mean, which is no sample.
+fn check_correction(sampling: SampleOptions) -> Result<()> {
+    if sampling.steps == 1 && sampling.samples == 1 {
+        return Ok(());
+    }
+    let what = format!("{} steps and {} samples, corrected", sampling.steps, sampling.samples);
+    let help = "correct the mean of one step: leave out --steps and --samples, or --correct";
+    Err(CliError::new(what, "--correct", help))
+}
+
+/// Loads the built-in diffusion, whose frames some weights of the regression correct.
+fn first_frames(
+    options: &NetworkOptions,
+    precision: ComputePrecision,
+    device: &Device,
+) -> Result<Arc<DiffusionRestorer<Window>>> {
+    let built_in = Weights::BuiltIn(BuiltIn::Diffusion);
+    let (network, description) = built_in.load::<Window>(device)?;
+    let Description { network: NetworkConfig::Window(config), window, passes, .. } = description
+    else {
+        unreachable!("a window network has sizes of one")
+    };
+    let model = Model { network, config, window, passes };
+    let options = SampleOptions { tile: options.tile, precision, ..SampleOptions::default() };
+    Ok(Arc::new(DiffusionRestorer::new(model, options, device)?))
 }
 
 fn sample_options(

@@ -30,6 +30,8 @@ pub(crate) struct NetworkOptions {
     pub(crate) sampler: Sampler,
     /// Passes of encoding.
     pub(crate) passes: usize,
+    /// True if the mean of one step is corrected.
+    pub(crate) correct: bool,
     /// What finds the motion; none for the best that the weights can follow.
     pub(crate) flow: Option<FlowSource>,
     /// The number of samples.

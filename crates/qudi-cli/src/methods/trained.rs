@@ -4,11 +4,10 @@ use super::network::OwnNetwork;
 use super::options::NetworkOptions;
 use super::{Kind, Method};
 use crate::error::{CliError, Result};
-use crate::weights::Weights;
+use crate::weights::{BuiltIn, Weights};
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_layers::Provenance;
-use qudi_model::config::NetworkKind;
 
 /// How far outside the light it was trained for a network may be used: it has not seen such noise.
 const LIGHT_TOLERANCE: f64 = 10.0;
@@ -45,7 +44,7 @@ impl Trained {
 
 /// Returns why the bundled weights are not for such a capture, if they are not.
 pub(crate) fn unknown_to_built_in(acquisition: &Acquisition) -> Result<Option<String>> {
-    Ok(unknown(&Weights::BuiltIn(NetworkKind::Regression).describe()?.provenance, acquisition, 1.0))
+    Ok(unknown(&Weights::BuiltIn(BuiltIn::Regression).describe()?.provenance, acquisition, 1.0))
 }
 
 /// Returns true if the bundled weights were trained for such a capture.

@@ -178,7 +178,17 @@ impl<N: Denoiser> DiffusionRestorer<N> {
         Ok(Self { network, config, schedule, options, device, window, batch_pixels })
     }
 
-    fn restored(&self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+    /// Returns the network.
+    pub fn network(&self) -> &N {
+        &self.network
+    }
+
+    /// Restores all frames of a window, in the precision that holds where this is called.
+    pub(crate) fn restored(
+        &self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+    ) -> Result<Restored> {
         let window = self.window_of(burst, acquisition);
         let mut moments = Moments::default();
         for number in 0..self.options.samples as u64 {

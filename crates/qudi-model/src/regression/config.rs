@@ -1,7 +1,7 @@
 //! Sizes of the regression.
 
 use crate::aligned::AlignedNeighbours;
-use crate::config::{Rule, SIZES, are_widths, check};
+use crate::config::{Rule, SIZES, are_widths, check, is_default, never};
 use qudi_burst::Alignments;
 use qudi_core::{Result, Size};
 use schemars::JsonSchema;
@@ -10,6 +10,17 @@ use serde::{Deserialize, Serialize};
 /// Height and width of padded frames are multiples of this. Another value would change pixels at the right
 /// and lower border.
 const MULTIPLE: usize = 32;
+
+/// The frames that the second pre-denoiser corrects, and that its inputs are aligned on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum FirstFrames {
+    /// Frames of the classical reference estimate, corrected by the first pre-denoiser.
+    #[default]
+    Refinement,
+    /// Means that the network `window` predicts in one step; there is no first pre-denoiser.
+    Diffusion,
+}
 
 /// Sizes of the regression. Both pre-denoisers have the same, but for the alignments of their neighbours.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -27,6 +38,10 @@ pub struct RegressionConfig {
     pub neighbours: usize,
     /// Channels of the layers that weight neighbours pixel by pixel.
     pub weight_channels: usize,
+    /// Frames that the second pre-denoiser corrects: `refinement` or `diffusion`.
+    #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
+    pub first: FirstFrames,
 }
 
 impl RegressionConfig {

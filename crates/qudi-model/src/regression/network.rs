@@ -1,6 +1,6 @@
 //! The weights of the regression: two pre-denoisers and the uncertainty head.
 
-use super::config::RegressionConfig;
+use super::config::{FirstFrames, RegressionConfig};
 use super::input::NormalizedInput;
 use super::predenoiser::PreDenoiser;
 use super::uncertainty::UncertaintyHead;
@@ -13,8 +13,9 @@ use qudi_layers::init_parameters;
 /// The network of the regression.
 #[derive(Module, Debug)]
 pub struct Regression {
-    /// First pre-denoiser: the window is aligned again on what it restores.
-    refinement: PreDenoiser,
+    /// First pre-denoiser: the window is aligned again on what it restores. None where the frames of another
+    /// network take its place.
+    refinement: Option<PreDenoiser>,
     /// Second pre-denoiser.
     pre: PreDenoiser,
     uncertainty: UncertaintyHead,
@@ -30,8 +31,10 @@ impl RegressionConfig {
 
     /// Creates the network without weights: it takes no memory yet.
     pub fn uninitialized(&self, device: &Device) -> Regression {
+        let refinement = (self.first == FirstFrames::Refinement)
+            .then(|| self.init_predenoiser(self.first_neighbours(), device));
         Regression {
-            refinement: self.init_predenoiser(self.first_neighbours(), device),
+            refinement,
             pre: self.init_predenoiser(self.second_neighbours(), device),
             uncertainty: self.init_uncertainty(device),
         }
@@ -39,9 +42,15 @@ impl RegressionConfig {
 }
 
 impl Regression {
-    /// Returns the first pre-denoiser.
-    pub fn refinement(&self) -> &PreDenoiser {
-        &self.refinement
+    /// Returns the first pre-denoiser, if the network has one.
+    pub fn refinement(&self) -> Option<&PreDenoiser> {
+        self.refinement.as_ref()
+    }
+
+    /// Returns the network without its first pre-denoiser, to correct frames of another network.
+    #[must_use]
+    pub fn without_refinement(self) -> Self {
+        Self { refinement: None, ..self }
     }
 
     /// Pre-denoises frames that were aligned on what the first pre-denoiser restored: the frames, and the

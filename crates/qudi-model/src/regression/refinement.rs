@@ -6,14 +6,17 @@ use super::network::Regression;
 use super::predenoiser::PreDenoiser;
 use crate::aligned::{Aligned, AlignedNeighbours};
 use crate::counts::MAX_IMAGE;
+use crate::diffusion::DiffusionRestorer;
+use crate::window::Window;
 use burn::tensor::{Device, Tensor};
 use qudi_burst::{AlignedBurst, ReferenceEstimate};
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView};
-use qudi_core::{Frame, Result};
+use qudi_core::{Error, Frame, Result};
 use qudi_layers::Tiling;
 use qudi_layers::tensor::to_tensor;
 use std::ops::Range;
+use std::sync::Arc;
 
 /// Sigma of the errors that a pre-denoised frame does not share with the next one, in units of the sigma of
 /// the merged frame's noise.
@@ -30,16 +33,16 @@ pub struct Refinement {
 }
 
 impl Refinement {
-    /// Takes the first pre-denoiser of a network whose weights are on `device`. It sees tiles of `tile`
+    /// Takes the first pre-denoiser of a network, whose weights are on `device`. It sees tiles of `tile`
     /// pixels.
     pub fn new(
-        network: &Regression,
+        predenoiser: &PreDenoiser,
         config: &RegressionConfig,
         tile: usize,
         device: &Device,
     ) -> Self {
         Self {
-            predenoiser: network.refinement().clone(),
+            predenoiser: predenoiser.clone(),
             neighbours: config.first_neighbours(),
             fold: config.fold,
             tile,
@@ -71,29 +74,69 @@ impl Refinement {
     }
 }
 
+/// The frames that bursts are aligned on.
+#[derive(Clone, Debug)]
+pub enum AlignmentFrames {
+    /// The classical reference estimate.
+    ReferenceEstimate,
+    /// The reference estimate, corrected by the first pre-denoiser.
+    Refinement(Refinement),
+    /// Means that the window network predicts.
+    Diffusion(Arc<DiffusionRestorer<Window>>),
+}
+
+impl AlignmentFrames {
+    /// Returns the frames that the second pre-denoiser of a network corrects: the first one's, or those that
+    /// `diffusion` predicts. The first one sees tiles of `tile` pixels.
+    ///
+    /// # Errors
+    /// [`Error::Request`] if the network has no first pre-denoiser and there is no diffusion, or both.
+    pub fn new(
+        network: &Regression,
+        config: &RegressionConfig,
+        diffusion: Option<Arc<DiffusionRestorer<Window>>>,
+        tile: usize,
+        device: &Device,
+    ) -> Result<Self> {
+        match (network.refinement(), diffusion) {
+            (Some(first), None) => {
+                Ok(Self::Refinement(Refinement::new(first, config, tile, device)))
+            }
+            (None, Some(diffusion)) => Ok(Self::Diffusion(diffusion)),
+            (Some(_), Some(_)) => {
+                let what = "first frames for a network that restores its own";
+                Err(Error::request(what, "network.first", "leave them out"))
+            }
+            (None, None) => {
+                let what = "a network that corrects the frames of a diffusion, without one";
+                Err(Error::request(what, "network.first", "name weights of the network `window`"))
+            }
+        }
+    }
+}
+
 /// Aligns bursts for one of the two pre-denoisers.
 #[derive(Clone, Debug)]
 pub struct BurstAligner {
-    /// Restores what the second pre-denoiser's inputs are aligned on; the first one's are aligned on the
-    /// reference estimate.
-    refinement: Option<Refinement>,
+    frames: AlignmentFrames,
     neighbours: AlignedNeighbours,
 }
 
 impl BurstAligner {
     /// Creates the aligner of the first pre-denoiser.
     pub fn first(config: &RegressionConfig) -> Self {
-        Self { refinement: None, neighbours: config.first_neighbours() }
+        let frames = AlignmentFrames::ReferenceEstimate;
+        Self { frames, neighbours: config.first_neighbours() }
     }
 
     /// Creates the aligner of the second pre-denoiser.
-    pub fn second(config: &RegressionConfig, refinement: Refinement) -> Self {
-        Self { refinement: Some(refinement), neighbours: config.second_neighbours() }
+    pub fn second(config: &RegressionConfig, frames: AlignmentFrames) -> Self {
+        Self { frames, neighbours: config.second_neighbours() }
     }
 
-    /// Returns the refinement; none for the first pre-denoiser.
-    pub fn refinement(&self) -> Option<&Refinement> {
-        self.refinement.as_ref()
+    /// Returns the frames that bursts are aligned on.
+    pub fn frames(&self) -> &AlignmentFrames {
+        &self.frames
     }
 
     /// Returns the neighbours that are aligned with each frame.
@@ -106,10 +149,19 @@ impl BurstAligner {
     /// # Errors
     /// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown, or a device fails.
     pub fn align(&self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<AlignedBurst> {
-        let aligned = AlignedBurst::new(ReferenceEstimate::compute(burst, acquisition)?);
-        let Some(refinement) = &self.refinement else { return Ok(aligned) };
-        let restored = refinement.restore(&aligned)?;
-        Ok(aligned.realign(restored))
+        let classical = || Ok(AlignedBurst::new(ReferenceEstimate::compute(burst, acquisition)?));
+        match &self.frames {
+            AlignmentFrames::ReferenceEstimate => classical(),
+            AlignmentFrames::Refinement(refinement) => {
+                let aligned = classical()?;
+                let restored = refinement.restore(&aligned)?;
+                Ok(aligned.realign(restored))
+            }
+            AlignmentFrames::Diffusion(diffusion) => {
+                let restored = diffusion.restored(burst, acquisition)?.frames;
+                AlignedBurst::on_frames(burst, acquisition, restored)
+            }
+        }
     }
 
     /// Aligns a burst and collects the planes of some of its frames.
@@ -230,6 +282,10 @@ mod tests {
         (config, network)
     }
 
+    fn first(network: &Regression) -> &PreDenoiser {
+        network.refinement().unwrap_or_else(|| panic!("no first pre-denoiser"))
+    }
+
     /// What lies far from the borders of a tile does not know of them.
     #[test]
     fn refinement_restores_in_tiles_of_the_given_size() {
@@ -239,7 +295,7 @@ mod tests {
         let aligner = BurstAligner::first(&config);
         let [whole, tiled] = [512, 32].map(|tile| {
             let aligned = aligner.align(burst, &acquisition).unwrap_or_else(|e| panic!("{e}"));
-            let refinement = Refinement::new(&network, &config, tile, &device);
+            let refinement = Refinement::new(first(&network), &config, tile, &device);
             refinement.restore(&aligned).unwrap_or_else(|e| panic!("{e}"))
         });
         let pairs = |x: std::ops::Range<usize>| {
@@ -255,17 +311,16 @@ mod tests {
         let (acquisition, frames, device) = (acquisition(), counts(), Device::flex());
         let burst = BurstView { size: SIZE, frames: &frames };
         let (config, network) = network();
-        let refinement = Refinement::new(&network, &config, 512, &device);
-        let [first, second] =
-            [BurstAligner::first(&config), BurstAligner::second(&config, refinement)].map(
-                |aligner| {
-                    let planes = aligner.planes(burst, &acquisition, 1..2);
-                    planes.unwrap_or_else(|e| panic!("{e}")).to_tensors(SIZE, &device)
-                },
-            );
-        assert_eq!(first.counts.len(), 1 + 2 * config.neighbours);
+        let refinement = Refinement::new(first(&network), &config, 512, &device);
+        let frames = AlignmentFrames::Refinement(refinement);
+        let aligners = [BurstAligner::first(&config), BurstAligner::second(&config, frames)];
+        let [first_planes, second] = aligners.map(|aligner| {
+            let planes = aligner.planes(burst, &acquisition, 1..2);
+            planes.unwrap_or_else(|e| panic!("{e}")).to_tensors(SIZE, &device)
+        });
+        assert_eq!(first_planes.counts.len(), 1 + 2 * config.neighbours);
         assert_eq!(second.counts.len(), 1 + 3 * config.neighbours);
-        let frame = network.refinement().predenoise(&first);
+        let frame = first(&network).predenoise(&first_planes);
         assert_eq!(frame.dims(), [1, 1, SIZE.height, SIZE.width]);
         let (frame, sigma) = network.predenoise(&second);
         assert_eq!(frame.dims(), sigma.dims());

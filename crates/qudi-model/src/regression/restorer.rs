@@ -3,15 +3,18 @@
 use super::config::RegressionConfig;
 use super::network::Regression;
 use super::refinement::{
-    BurstAligner, PredenoisedFrames, Refinement, filter_over_time, predenoise_frames,
+    AlignmentFrames, BurstAligner, PredenoisedFrames, filter_over_time, predenoise_frames,
 };
 use crate::aligned::Aligned;
+use crate::diffusion::DiffusionRestorer;
 use crate::restorer::{Model, check_frames, check_tile};
+use crate::window::Window;
 use burn::tensor::{Device, Tensor};
 use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_layers::Tiling;
+use std::sync::Arc;
 
 /// The largest standard deviation that a value in [0, 1] can have (Popoviciu 1935).
 const MAX_UNCERTAINTY: f32 = 0.5;
@@ -31,20 +34,22 @@ pub struct RegressionRestorer {
 
 impl RegressionRestorer {
     /// Creates the restorer of a model whose weights are on `device`. The network sees tiles of `tile`
-    /// pixels.
+    /// pixels. `diffusion` predicts the first frames of networks without a first pre-denoiser.
     ///
     /// # Errors
-    /// [`Error::Request`](qudi_core::Error::Request) if the tiles are too small.
+    /// [`Error::Request`](qudi_core::Error::Request) if the tiles are too small, or first frames are missing
+    /// or not needed.
     pub fn new(
         model: Model<Regression, RegressionConfig>,
+        diffusion: Option<Arc<DiffusionRestorer<Window>>>,
         tile: usize,
         precision: ComputePrecision,
         device: &Device,
     ) -> Result<Self> {
         let Model { network, config, window, .. } = model;
         check_tile(tile, config.multiple())?;
-        let refinement = Refinement::new(&network, &config, tile, device);
-        let aligner = BurstAligner::second(&config, refinement);
+        let first = AlignmentFrames::new(&network, &config, diffusion, tile, device)?;
+        let aligner = BurstAligner::second(&config, first);
         Ok(Self { network, aligner, config, tile, precision, device: device.clone(), window })
     }
 
@@ -73,7 +78,10 @@ impl RegressionRestorer {
 
 impl Restorer for RegressionRestorer {
     fn name(&self) -> &'static str {
-        "qudi-regression"
+        match self.aligner.frames() {
+            AlignmentFrames::Diffusion(_) => "qudi-diffusion",
+            _ => "qudi-regression",
+        }
     }
 
     fn window(&self) -> usize {

@@ -152,7 +152,7 @@ impl BurstSampler {
 mod tests {
     use super::*;
     use qudi_layers::TILE;
-    use qudi_model::regression::Refinement;
+    use qudi_model::regression::{AlignmentFrames, Refinement};
 
     fn recipe(crops: &str) -> Recipe {
         let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.crops", crops)];
@@ -301,8 +301,11 @@ mod tests {
         // What other weights restored is something else, too.
         let device = burn::tensor::Device::flex();
         let config = recipe.network.regression().unwrap_or_else(|e| panic!("{e}"));
-        let refinement = Refinement::new(&config.init(1, &device), config, TILE, &device);
-        let aligner = Some(BurstAligner::second(config, refinement));
+        let network = config.init(1, &device);
+        let refinement = network.refinement().unwrap_or_else(|| panic!("no first pre-denoiser"));
+        let refinement = Refinement::new(refinement, config, TILE, &device);
+        let frames = AlignmentFrames::Refinement(refinement);
+        let aligner = Some(BurstAligner::second(config, frames));
         let refined = BurstSampler { aligner, ..of(&recipe) };
         let mut refined =
             refined.with_cache(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));

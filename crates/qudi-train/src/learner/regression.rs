@@ -13,9 +13,16 @@ use qudi_kernels::ComputePrecision;
 use qudi_layers::TILE;
 use qudi_layers::tensor::to_tensor;
 use qudi_model::aligned::Aligned;
+use qudi_model::checkpoint::{Description, describe, load};
 use qudi_model::config::NetworkConfig;
-use qudi_model::regression::{BurstAligner, Refinement, Regression, RegressionRestorer};
+use qudi_model::diffusion::{DiffusionRestorer, SampleOptions};
+use qudi_model::regression::{
+    AlignmentFrames, BurstAligner, FirstFrames, Regression, RegressionConfig, RegressionRestorer,
+};
+use qudi_model::restorer::Model;
+use qudi_model::window::Window;
 use std::path::Path;
+use std::sync::Arc;
 
 /// The samples of one pass.
 #[derive(Clone, Debug)]
@@ -53,8 +60,17 @@ impl Learner for Regression {
         Ok(recipe.network.regression()?.init(recipe.train.seed, device))
     }
 
+    /// Loads weights of the recipe's network. A correction of a diffusion can also start from a whole
+    /// regression, whose first pre-denoiser it leaves out.
     fn load(path: &Path, recipe: &Recipe, device: &Device) -> Result<Self> {
-        load_fitting(path, &NetworkConfig::Regression(recipe.network.regression()?.clone()), device)
+        let config = recipe.network.regression()?;
+        let whole = RegressionConfig { first: FirstFrames::Refinement, ..config.clone() };
+        let is_whole = describe(path)?.network == NetworkConfig::Regression(whole.clone());
+        if is_whole && *config != whole {
+            let (network, _) = load::<Self>(path, device)?;
+            return Ok(network.without_refinement());
+        }
+        load_fitting(path, &NetworkConfig::Regression(config.clone()), device)
     }
 
     fn draw(recipe: &Recipe, bursts: &mut BurstSampler, number: u64) -> Result<AlignedBatch> {
@@ -64,11 +80,14 @@ impl Learner for Regression {
     fn loss<'a>(&'a self, batch: &'a AlignedBatch, context: &Context<'a>) -> Result<Loss<'a>> {
         let aligned = batch.aligned.to_tensors(batch.size, context.device);
         let truth = to_tensor(batch.truth.clone(), batch.size, context.device);
-        let (frames, sigma) = if context.recipe.trains_refinement() {
-            (self.refinement().predenoise(&aligned), None)
-        } else {
-            let (frames, sigma) = self.predenoise(&aligned);
-            (frames, Some(sigma))
+        let (frames, sigma) = match self.refinement() {
+            Some(refinement) if context.recipe.trains_refinement() => {
+                (refinement.predenoise(&aligned), None)
+            }
+            _ => {
+                let (frames, sigma) = self.predenoise(&aligned);
+                (frames, Some(sigma))
+            }
         };
         let mut sum = WeightedSum::default();
         // One where the error is the reference estimate's.
@@ -91,7 +110,9 @@ impl Learner for Regression {
     fn restorer(&self, recipe: &Recipe, device: &Device) -> Result<Box<dyn Restorer>> {
         let config = recipe.network.regression()?.clone();
         let model = recipe.model(self.clone(), config);
-        Ok(Box::new(RegressionRestorer::new(model, TILE, ComputePrecision::F32, device)?))
+        let diffusion = diffusion(recipe, device)?;
+        let precision = ComputePrecision::F32;
+        Ok(Box::new(RegressionRestorer::new(model, diffusion, TILE, precision, device)?))
     }
 
     fn save(&self, recipe: &Recipe, origin: &Origin, path: &Path) -> Result<()> {
@@ -108,7 +129,22 @@ impl Learner for Regression {
         Ok(Some(if recipe.trains_refinement() {
             BurstAligner::first(config)
         } else {
-            BurstAligner::second(config, Refinement::new(self, config, TILE, device))
+            let diffusion = diffusion(recipe, device)?;
+            let frames = AlignmentFrames::new(self, config, diffusion, TILE, device)?;
+            BurstAligner::second(config, frames)
         }))
     }
+}
+
+/// Loads the window network whose frames are corrected; none where the recipe names none.
+fn diffusion(recipe: &Recipe, device: &Device) -> Result<Option<Arc<DiffusionRestorer<Window>>>> {
+    let Some(path) = &recipe.train.first else { return Ok(None) };
+    let (network, description) = load::<Window>(Path::new(path), device)?;
+    let Description { network: NetworkConfig::Window(config), window, passes, .. } = description
+    else {
+        unreachable!("a window network has sizes of one")
+    };
+    let model = Model { network, config, window, passes };
+    let restorer = DiffusionRestorer::new(model, SampleOptions::default(), device)?;
+    Ok(Some(Arc::new(restorer)))
 }

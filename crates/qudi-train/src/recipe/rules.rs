@@ -9,6 +9,7 @@ use qudi_baselines::method::Sizes;
 use qudi_core::{Error, Result};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::DiffusionConfig;
+use qudi_model::regression::FirstFrames;
 
 /// A key, true if it keeps the rule, and the rule.
 type Rule<'a> = (&'a str, bool, &'a str);
@@ -25,7 +26,7 @@ impl Recipe {
             NetworkRecipe::Qudi(NetworkConfig::Regression(config)) => {
                 self.check_foreign()?;
                 check(&self.sample_rules(1, config.fold))?;
-                check(&[self.regression_rule()])?;
+                check(&self.regression_rules(config.first))?;
             }
             NetworkRecipe::Qudi(NetworkConfig::Diffusion(config)) => {
                 self.check_diffusion(config)?;
@@ -72,10 +73,13 @@ impl Recipe {
     }
 
     /// Returns the rules of every network.
-    fn common_rules(&self) -> [Rule<'static>; 11] {
+    fn common_rules(&self) -> [Rule<'static>; 12] {
         let train = &self.train;
+        let is_regression =
+            matches!(&self.network, NetworkRecipe::Qudi(NetworkConfig::Regression(_)));
         let is_window = matches!(&self.network, NetworkRecipe::Qudi(NetworkConfig::Window(_)));
         [
+            ("train.first", is_regression || train.first.is_none(), "is for the regression"),
             ("train.passes", is_window || train.passes == 1, "is for the network `window`"),
             ("train.matched", (0.0..=1.0).contains(&train.matched), "must be from 0 to 1"),
             ("train.matched", is_window || train.matched == 0.0, "is for the network `window`"),
@@ -117,16 +121,29 @@ impl Recipe {
         ]
     }
 
-    /// Returns the rule of the parts of the regression that learn.
-    fn regression_rule(&self) -> Rule<'static> {
+    /// Returns the rules of the regression: of the parts that learn, and of the frames that they see.
+    fn regression_rules(&self, first: FirstFrames) -> [Rule<'static>; 3] {
         let learns = &self.train.learns;
         let second = [LearningPart::Pre, LearningPart::Uncertainty];
         let is_second = !learns.is_empty() && learns.iter().all(|part| second.contains(part));
-        (
-            "train.learns",
-            self.trains_refinement() || is_second,
-            "must be [\"refinement\"], or of \"pre\" and \"uncertainty\", which learn from what the refinement restores",
-        )
+        let has_refinement = first == FirstFrames::Refinement;
+        [
+            (
+                "train.learns",
+                self.trains_refinement() || is_second,
+                "must be [\"refinement\"], or of \"pre\" and \"uncertainty\", which learn from what the refinement restores",
+            ),
+            (
+                "train.learns",
+                has_refinement || is_second,
+                "must be of \"pre\" and \"uncertainty\" with network.first = \"diffusion\"",
+            ),
+            (
+                "train.first",
+                has_refinement == self.train.first.is_none(),
+                "belongs to network.first = \"diffusion\": it names weights of `window`, as `--set train.first=FILE`",
+            ),
+        ]
     }
 
     /// Checks the keys that every diffusion needs.

@@ -32,7 +32,7 @@ pub(crate) struct Bench {
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) compare: Option<PathBuf>,
     /// Measure training steps of this recipe instead
-    #[arg(long, value_name = "RECIPE", conflicts_with_all = ["method", "size", "frames", "rounds", "compare", "steps", "weights", "spacing", "sampler", "passes", "flow", "samples", "tile", "precision"])]
+    #[arg(long, value_name = "RECIPE", conflicts_with_all = ["method", "size", "frames", "rounds", "compare", "steps", "weights", "spacing", "sampler", "passes", "flow", "correct", "samples", "tile", "precision"])]
     pub(crate) train: Option<String>,
     /// --train: the recipe's decoded data, made by `qudi train --prepare`
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, requires = "train")]

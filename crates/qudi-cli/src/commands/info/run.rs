@@ -8,14 +8,13 @@ use crate::error::{CliError, Result};
 use crate::methods::{QUDI_DIFFUSION, QUDI_REGRESSION, learned_names};
 use crate::report::Report;
 use crate::settings::{Settings, recipe_keys, toml_text};
-use crate::weights::Weights;
+use crate::weights::{BuiltIn, Weights};
 use burn::tensor::Device;
 use qudi_baselines::import::{Contents, describe};
 use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
 use qudi_io::codec::FORMATS;
 use qudi_io::sidecar::Sidecar;
 use qudi_layers::Provenance;
-use qudi_model::config::NetworkKind;
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -113,13 +112,16 @@ fn sensors(report: &Report) -> Result<()> {
 
 /// Describes the networks in the program.
 fn built_in_weights(report: &Report) -> Result<()> {
-    let methods =
-        [(QUDI_REGRESSION, NetworkKind::Regression), (QUDI_DIFFUSION, NetworkKind::Diffusion)];
+    let methods = [
+        (QUDI_REGRESSION.name, BuiltIn::Regression),
+        (QUDI_DIFFUSION.name, BuiltIn::Diffusion),
+        ("qudi-diffusion --correct", BuiltIn::Correction),
+    ];
     let (mut texts, mut documents) = (Vec::new(), Map::new());
-    for (method, kind) in methods {
-        let (text, document) = weights(&Weights::BuiltIn(kind))?;
-        texts.push(format!("method      {}\n{text}", method.name));
-        documents.insert(method.name.to_owned(), document);
+    for (method, network) in methods {
+        let (text, document) = weights(&Weights::BuiltIn(network))?;
+        texts.push(format!("method      {method}\n{text}"));
+        documents.insert(method.to_owned(), document);
     }
     report.result(&texts.join("\n\n"), || Value::Object(documents))
 }

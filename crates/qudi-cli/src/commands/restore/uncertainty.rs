@@ -28,11 +28,12 @@ impl UncertaintyFile {
             return Err(CliError::new(what, "--uncertainty", help));
         };
         let own = OwnNetwork::new(&plan.network, choice)?;
-        if plan.network.samples < 2 && own.kind().is_diffusion() {
+        let is_drawn = own.kind().is_diffusion() && !plan.network.correct;
+        if plan.network.samples < 2 && is_drawn {
             return Err(CliError::new(
                 "one sample has no uncertainty",
                 "--uncertainty",
-                "draw several with --samples K, or use --method qudi-regression, which predicts it",
+                "draw several with --samples K, or predict it with --correct or --method qudi-regression",
             ));
         }
         if path.extension() != Some("npy".as_ref()) {

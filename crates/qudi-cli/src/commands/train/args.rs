@@ -11,8 +11,9 @@ use std::path::PathBuf;
 /// restore --weights`, and the state that --resume goes on from, exactly.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Train {
-    /// The recipe: tiny, small, window, paper-mini, paper, a learned baseline (quiver, emvd, flornn,
-    /// spk2imgnet, memdeblur, rvrt, student-teacher), or a .toml file [default with --resume: the run's own]
+    /// The recipe: tiny, small, window, correction, paper-mini, paper, a learned baseline (quiver, emvd,
+    /// flornn, spk2imgnet, memdeblur, rvrt, student-teacher), or a .toml file [default with --resume: the
+    /// run's own]
     pub(crate) recipe: Option<String>,
     /// Folder of the run
     #[arg(short, long, value_name = "FOLDER", value_hint = ValueHint::DirPath, required_unless_present = "prepare")]
