@@ -80,7 +80,7 @@ pub enum AlignmentFrames {
     /// The classical reference estimate.
     ReferenceEstimate,
     /// The reference estimate, corrected by the first pre-denoiser.
-    Refinement(Refinement),
+    Refinement(Box<Refinement>),
     /// Means that the window network predicts.
     Diffusion(Arc<DiffusionRestorer<Window>>),
 }
@@ -100,7 +100,7 @@ impl AlignmentFrames {
     ) -> Result<Self> {
         match (network.refinement(), diffusion) {
             (Some(first), None) => {
-                Ok(Self::Refinement(Refinement::new(first, config, tile, device)))
+                Ok(Self::Refinement(Box::new(Refinement::new(first, config, tile, device))))
             }
             (None, Some(diffusion)) => Ok(Self::Diffusion(diffusion)),
             (Some(_), Some(_)) => {
@@ -312,7 +312,7 @@ mod tests {
         let burst = BurstView { size: SIZE, frames: &frames };
         let (config, network) = network();
         let refinement = Refinement::new(first(&network), &config, 512, &device);
-        let frames = AlignmentFrames::Refinement(refinement);
+        let frames = AlignmentFrames::Refinement(Box::new(refinement));
         let aligners = [BurstAligner::first(&config), BurstAligner::second(&config, frames)];
         let [first_planes, second] = aligners.map(|aligner| {
             let planes = aligner.planes(burst, &acquisition, 1..2);

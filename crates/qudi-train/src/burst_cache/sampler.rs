@@ -304,7 +304,7 @@ mod tests {
         let network = config.init(1, &device);
         let refinement = network.refinement().unwrap_or_else(|| panic!("no first pre-denoiser"));
         let refinement = Refinement::new(refinement, config, TILE, &device);
-        let frames = AlignmentFrames::Refinement(refinement);
+        let frames = AlignmentFrames::Refinement(Box::new(refinement));
         let aligner = Some(BurstAligner::second(config, frames));
         let refined = BurstSampler { aligner, ..of(&recipe) };
         let mut refined =
