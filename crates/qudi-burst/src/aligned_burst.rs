@@ -101,18 +101,19 @@ impl AlignedBurst {
         sensor.dark_per_frame()?;
         let count = view.frames.len() as u32;
         let vst = VarianceStabilizer::new(Transform::Integral, sensor, *gain, count);
-        let motion = BurstMotion::new(view, acquisition);
-        let references = motion.references(&frames);
-        let motions = frames.iter().map(|_| OnceLock::new()).collect();
-        Ok(Self { motion, vst, frames, references, motions })
+        Ok(Self::with_frames(BurstMotion::new(view, acquisition), vst, frames))
     }
 
     /// Aligns the window again on better frames, given in image units.
     #[must_use]
     pub fn realign(self, frames: Vec<Frame>) -> Self {
-        let references = self.motion.references(&frames);
+        Self::with_frames(self.motion, self.vst, frames)
+    }
+
+    fn with_frames(motion: BurstMotion, vst: VarianceStabilizer, frames: Vec<Frame>) -> Self {
+        let references = motion.references(&frames);
         let motions = frames.iter().map(|_| OnceLock::new()).collect();
-        Self { frames, references, motions, ..self }
+        Self { motion, vst, frames, references, motions }
     }
 
     /// Returns the size of the frames.

@@ -165,8 +165,8 @@ fn frames_of_a_diffusion_are_corrected() {
         assert_eq!(restorer.name(), "qudi-diffusion");
         restorer.restore(burst, &acquisition(1, 0)).unwrap()
     };
-    let model = Arc::into_inner(window()).unwrap();
-    let first = { model }.restore(burst, &acquisition(1, 0)).unwrap();
+    let mut diffusion = Arc::into_inner(window()).unwrap();
+    let first = diffusion.restore(burst, &acquisition(1, 0)).unwrap();
     let distance = |one: &Restored, other: &Restored| {
         let pixels = |all: &Restored| -> Vec<f32> {
             all.frames.iter().flat_map(|frame| frame.data.clone()).collect()
@@ -183,11 +183,8 @@ fn frames_of_a_diffusion_are_corrected() {
     assert!(corrected.std.is_some_and(|std| std.len() == 4));
     let error = correction(None, true).unwrap_err().to_string();
     assert!(error.contains("corrects the frames of a diffusion"), "{error}");
-    let (config, network) = {
-        let config = regression_config();
-        let network = config.init(2, &Device::flex());
-        (config, network)
-    };
+    let config = regression_config();
+    let network = config.init(2, &Device::flex());
     let model = Model { network, config, window: 11, passes: 1 };
     let both =
         RegressionRestorer::new(model, Some(window()), 512, ComputePrecision::F32, &Device::flex());

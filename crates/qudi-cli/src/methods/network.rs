@@ -17,7 +17,7 @@ use qudi_model::config::{NetworkConfig, NetworkKind};
 use qudi_model::diffusion::{Diffusion, DiffusionRestorer, FlowSource, SampleOptions};
 use qudi_model::regression::{FirstFrames, Regression, RegressionConfig, RegressionRestorer};
 use qudi_model::restorer::Model;
-use qudi_model::window::Window;
+use qudi_model::window::{Window, WindowConfig};
 use serde_json::{Value, json};
 use std::sync::Arc;
 
@@ -157,7 +157,6 @@ pub(crate) fn restorer(
     }
     let precision = options.precision(&device)?;
     let corrects = own.corrects_diffusion();
-    let Description { window, passes, .. } = own.description;
     let restorer: Box<dyn Restorer> = match own.kind {
         NetworkKind::Regression => {
             let model = regression_model(&own.weights, &device.device)?;
@@ -173,18 +172,19 @@ pub(crate) fn restorer(
         NetworkKind::Diffusion => {
             let (network, description) = own.weights.load::<Diffusion>(&device.device)?;
             let NetworkConfig::Diffusion(config) = description.network else { unreachable!() };
+            let Description { window, passes, .. } = own.description;
             let model = Model { network, config, window, passes };
             let options = sample_options(&own, options, precision);
             Box::new(DiffusionRestorer::new(model, options, &device.device)?)
         }
         NetworkKind::Window => {
-            let (network, description) = own.weights.load::<Window>(&device.device)?;
-            let NetworkConfig::Window(config) = description.network else { unreachable!() };
-            let model = Model { network, config, window, passes };
             let sampling = sample_options(&own, options, precision);
-            let diffusion = DiffusionRestorer::new(model, sampling, &device.device)?;
             if options.correct {
                 check_correction(sampling)?;
+            }
+            let model = window_model(&own.weights, &device.device)?;
+            let diffusion = DiffusionRestorer::new(model, sampling, &device.device)?;
+            if options.correct {
                 let built_in = Weights::BuiltIn(BuiltIn::Correction);
                 let model = regression_model(&built_in, &device.device)?;
                 let (first, tile) = (Some(Arc::new(diffusion)), options.tile);
@@ -211,6 +211,16 @@ fn regression_model(
     Ok(Model { network, config, window, passes })
 }
 
+/// Loads a window network.
+fn window_model(weights: &Weights, device: &Device) -> Result<Model<Window, WindowConfig>> {
+    let (network, description) = weights.load::<Window>(device)?;
+    let Description { network: NetworkConfig::Window(config), window, passes, .. } = description
+    else {
+        unreachable!("a window network has sizes of one")
+    };
+    Ok(Model { network, config, window, passes })
+}
+
 /// Refuses to correct anything but the mean, which is no sample.
 fn check_correction(sampling: SampleOptions) -> Result<()> {
     if sampling.steps == 1 && sampling.samples == 1 {
@@ -227,13 +237,7 @@ fn first_frames(
     precision: ComputePrecision,
     device: &Device,
 ) -> Result<Arc<DiffusionRestorer<Window>>> {
-    let built_in = Weights::BuiltIn(BuiltIn::Diffusion);
-    let (network, description) = built_in.load::<Window>(device)?;
-    let Description { network: NetworkConfig::Window(config), window, passes, .. } = description
-    else {
-        unreachable!("a window network has sizes of one")
-    };
-    let model = Model { network, config, window, passes };
+    let model = window_model(&Weights::BuiltIn(BuiltIn::Diffusion), device)?;
     let options = SampleOptions { tile: options.tile, precision, ..SampleOptions::default() };
     Ok(Arc::new(DiffusionRestorer::new(model, options, device)?))
 }
